@@ -1,39 +1,33 @@
-"""Fixtures for many tests: systems, results, an own cache folder and working directory, and pools
-that compute in this process.
+"""Fixtures for many tests: systems, results, an own cache folder and working directory, and where
+pools compute.
 """
 
 from __future__ import annotations
 
 import os
-import pickle
-import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import hypothesis
 import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import local
-from safevar_sumo.cli.program import COMMANDS, command_function
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.questions import cases, repair
-from safevar_sumo.questions.answer import Answer, Contents, contents_of
+from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.repair import survivors
 from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.sumo.system import System
-from tests.support import planted_sled
+from tests.support import in_process, planted_sled
 from tests.support.in_process import (
     EVERY_STUDY,
     InlinePool,
     allow_few_simulations,
-    inline_worker,
     searched,
 )
 from tests.support.made_up import FITS, system_of
@@ -49,7 +43,6 @@ hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
 # Programs that tests start need not compile the package each time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-WORKER_PROCESSES = local.ProcessWorker
 SLIPPERY = """
 extends = "smoke"
 name = "slippery"
@@ -71,48 +64,16 @@ runs = 1
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _own_cache_and_pools_of_this_process(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[None]:
-    """Each session of tests builds its own networks, once for all of its processes; commands start
-    no worker processes and keep no simulations, by which a test would check itself. A text of a
-    study, which hundreds of tests read, is parsed once.
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Each session of tests builds its own networks, once for all of its processes. It keeps no
+    simulations, by which a test would check itself.
     """
-    parse = tomllib.loads
-    parsed = cache(lambda text: pickle.dumps(parse(text)))
     session = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        session = session.parent
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(
-            "XDG_CACHE_HOME",
-            str(
-                (session.parent if "PYTEST_XDIST_WORKER" in os.environ else session)
-                / "cache"
-            ),
-        )
+        patch.setenv("XDG_CACHE_HOME", str(session / "cache"))
         patch.setenv("SAFEVAR_CACHE", "off")
-        patch.setattr(local, "ProcessWorker", inline_worker)
-        patch.setattr(tomllib, "loads", lambda text: pickle.loads(parsed(text)))
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _answers_have_what_their_questions_declare() -> Iterator[None]:
-    """Whatever a test asks of the shipped questions."""
-    create = Answer.__init__
-
-    def create_and_check(answer: Answer, **values: Any) -> None:
-        create(answer, **values)
-        if answer.question in COMMANDS:
-            declared = contents_of(command_function(answer.question))
-            keys = Contents(
-                answer.numbers,
-                {name: [*frame] for name, frame in answer.tables.items()},
-            ).keys
-            for key in keys:
-                declared.check_key(key)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Answer, "__init__", create_and_check)
         yield
 
 
@@ -127,9 +88,15 @@ def _own_import_path() -> Iterator[None]:
 
 
 @pytest.fixture
+def pools_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pools that the library opens start no worker processes."""
+    monkeypatch.setattr(local, "ProcessWorker", in_process.inline_worker)
+
+
+@pytest.fixture
 def worker_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let pools start worker processes, as for a user."""
-    monkeypatch.setattr(local, "ProcessWorker", WORKER_PROCESSES)
+    """Commands that a test runs in this process start worker processes, as for a user."""
+    monkeypatch.setattr(in_process, "worker_of_commands", local.ProcessWorker)
 
 
 @pytest.fixture

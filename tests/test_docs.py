@@ -37,6 +37,7 @@ LIBRARY_OF_PAGE = {"docs/tools.md": "optuna"}
 
 
 @SLOW
+@pytest.mark.usefixtures("pools_in_this_process")
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
 def test_every_block_of_a_page_does_and_shows_what_it_says(
     page: str, in_tmp: Path

@@ -24,6 +24,7 @@ def test_the_list_of_examples_is_whole() -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("pools_in_this_process")
 @pytest.mark.parametrize("name", [name for name in EXAMPLES if name not in ELSEWHERE])
 def test_an_example_runs_as_it_is(name: str, in_tmp: Path) -> None:
     shutil.copytree(ROOT / "examples" / name, in_tmp, dirs_exist_ok=True)

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 import safevar_sumo as sv
-from tests.support.in_process import SLOW
+from tests.support.in_process import SLOW, InlinePool
 from tests.support.made_up import SUN, published_rows, uniform
 from tests.support.needs import need_library
 
@@ -85,7 +85,9 @@ def test_the_notebook_of_the_paper_shows_published_solutions_beside_a_study(
 ) -> None:
     """With made-up rows in the published format, and a smaller study."""
     settings = uniform(SUN, 60, 5)
-    rows = published_rows(SUN, settings, sv.evaluate("sun", settings))
+    rows = published_rows(
+        SUN, settings, sv.evaluate("sun", settings, pool=InlinePool())
+    )
     for name in ("nsga2", "rs", "fuzzer"):
         rows.to_csv(tmp_path / f"sun_{name}.csv", index=False)
     monkeypatch.setenv("SAFEVAR_PUBLISHED", str(tmp_path))

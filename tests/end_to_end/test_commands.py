@@ -69,6 +69,7 @@ def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("pools_in_this_process")
 def test_parts_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     keys = [(name, run) for name in ("nsga2", "rs", "safe_fuzzer") for run in range(2)]
     for k in (0, 1):

@@ -72,10 +72,16 @@ def test_in_a_matrix_the_point_counts_that_is_worst_by_the_measure() -> None:
     """
     study, worn = load_study("wear"), {"brakeTorque": 0.7}
     by_drac = sv.evaluate(
-        study_by(study, Unsafe.parse("drac > 5.7")), [worn], filtered=False, jobs=1
+        study_by(study, Unsafe.parse("drac > 5.7")),
+        [worn],
+        filtered=False,
+        pool=InlinePool(),
     )
     by_degree = sv.evaluate(
-        load_study("wear", metrics={"also": ["drac"]}), [worn], filtered=False, jobs=1
+        load_study("wear", metrics={"also": ["drac"]}),
+        [worn],
+        filtered=False,
+        pool=InlinePool(),
     )
     assert by_drac["drac"][0] == pytest.approx(5.87, abs=0.005)
     assert by_degree["drac"][0] == pytest.approx(2.14, abs=0.005)

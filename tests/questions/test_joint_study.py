@@ -22,7 +22,15 @@ from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.results.identity import identity_digest, manifest_of
 from safevar_sumo.sumo.system import assemble
-from tests.support.in_process import SLOW, json_of, refused, rows_of, run, searched
+from tests.support.in_process import (
+    SLOW,
+    InlinePool,
+    json_of,
+    refused,
+    rows_of,
+    run,
+    searched,
+)
 
 STUDY = """
 extends = "rain"
@@ -140,10 +148,13 @@ def test_the_margin_of_the_original_is_a_key_and_says_which_evaluations_are_feas
     assert (frame["feasible"] == (frame["original_safety_degree"] >= 0.4)).all()
     assert 0 < frame["feasible"].mean() < 1
     evaluated = sv.evaluate(
-        case.study, frame[[*case.characteristics.names]].head(8), filtered=False, jobs=1
+        case.study,
+        frame[[*case.characteristics.names]].head(8),
+        filtered=False,
+        pool=InlinePool(),
     )
     assert (evaluated["feasible"] == frame["feasible"].head(8)).all()
-    assert "feasible" not in sv.evaluate("smoke", [{}], jobs=1)
+    assert "feasible" not in sv.evaluate("smoke", [{}], pool=InlinePool())
     strict = load_study(case.study, scenario={"margin": 2.0})
     assert assemble(strict).measuring.scoring.safe_original == 2
     assert identity_digest(manifest_of(strict, {})) != identity_digest(
@@ -221,7 +232,9 @@ small pocket of the encounters, such as 0.15 km/h by 4 % of the path.
 @SLOW
 @pytest.mark.parametrize("name", WORN)
 def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
-    with open_evaluator(load_study(name, encounters="ranges"), jobs=2) as judging:
+    with open_evaluator(
+        load_study(name, encounters="ranges"), InlinePool(2)
+    ) as judging:
         bench = bench_of([Model(0, judging, Unsafe())], Unsafe(), between=False)
         original = bench.vehicle.original
         worn = np.array(

@@ -232,6 +232,11 @@ def test_an_answer_says_that_a_driving_system_counts_steps(
     }
     study = {"extends": "autoware_july", "name": "slow", **parts}
     answer = question(
-        study, quick=True, fits=0, unsafe="safety_degree < -30", jobs=1, **options
+        study,
+        quick=True,
+        fits=0,
+        unsafe="safety_degree < -30",
+        pool=InlinePool(),
+        **options,
     )
     assert COUNTS_STEPS in f"{answer.verdict} {answer.tested}"

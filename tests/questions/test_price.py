@@ -75,7 +75,7 @@ def test_the_least_number_is_told_before_anything_is_simulated(
 
 @SLOW
 def test_a_rough_comparison_keeps_to_its_number_in_a_matrix() -> None:
-    answer = sv.compare("wear", "wear", simulations=1000, jobs=1)
+    answer = sv.compare("wear", "wear", simulations=1000, pool=InlinePool())
     assert answer.numbers["simulations"] <= 1000
     assert "Rough answer (--simulations 1000): " in answer.verdict
 

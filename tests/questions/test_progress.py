@@ -15,7 +15,7 @@ from hypothesis import given, strategies as st
 import safevar_sumo as sv
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.terminal import Pace, Parts
-from tests.support.in_process import SLOW
+from tests.support.in_process import SLOW, InlinePool
 
 RECORDED = Path(__file__).with_name("progress.csv")
 """What `benchmarks/progress.py` recorded: command, time [s], done, total; the last row of a command
@@ -51,7 +51,7 @@ def test_phases_come_in_order_and_all_that_is_done_is_in_the_total(
     ask: Callable[..., Any], options: Mapping[str, Any]
 ) -> None:
     shown = Shown()
-    ask("smoke", jobs=1, progress=lambda *one: shown.append(one), **options)
+    ask("smoke", pool=InlinePool(), progress=lambda *one: shown.append(one), **options)
     assert_counts(shown)
     assert all(earlier[1] <= later[1] for earlier, later in pairwise(shown))
     assert shown[-1][1] > 0

@@ -50,6 +50,7 @@ def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
 
 
 @SLOW
+@pytest.mark.usefixtures("pools_in_this_process")
 def test_a_rough_page_has_no_line_to_sign_and_no_other_parameter_set(
     slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -72,7 +73,7 @@ def test_on_a_terminal_the_rough_answer_comes_first(
         monkeypatch.setattr(
             sys.stderr, "isatty", lambda answer=is_terminal: answer, raising=False
         )
-        answer = sv.explain("smoke", fits=0, progress=True)
+        answer = sv.explain("smoke", fits=0, progress=True, pool=InlinePool())
         assert answer.numbers["rough"] is False
         assert ("Rough answer (--quick" in capsys.readouterr().err) == is_terminal
 

@@ -38,9 +38,10 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import VEHICLES
 from tests.support.in_process import SLOW, run, searched
-from tests.support.report_pages import ASK, page_of
-from tests.support.words_of_pages import words_of
+from tests.support.report_pages import ASK, page_of, words_of
 from tools.manual import PROGRAM
+
+pytestmark = pytest.mark.usefixtures("pools_in_this_process")
 
 
 class Outline(HTMLParser):

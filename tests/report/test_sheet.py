@@ -17,6 +17,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.report.sheet import speed_values
 from safevar_sumo.scenarios.declared import read_study, with_ranges
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.support.report_pages import words_of
 from tests.support.sheets import (
     COMMAND,
     LIMITS,
@@ -28,7 +29,6 @@ from tests.support.sheets import (
     speed_of,
     with_table,
 )
-from tests.support.words_of_pages import words_of
 
 CHARACTERISTICS = CharacteristicSet.of(STUDY)
 

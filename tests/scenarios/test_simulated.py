@@ -408,6 +408,7 @@ def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("pools_in_this_process")
 def test_a_page_with_few_simulations_has_the_replay_with_the_fewest_changes(
     wall: Path,
 ) -> None:
@@ -768,9 +769,11 @@ def test_a_pack_states_the_number_that_followed_from_time(
         seconds = "safevar_sumo.questions.evaluator.seconds_of_simulation"
         patch.setattr(seconds, lambda *_: 0.001)  # whatever else this machine does
         run("evidence results --out pack.zip --ask 'risk --samples 4000'")
-        first = sv.risk("results")
+        first = sv.risk("results", pool=InlinePool())
     assert re.search(r"risk results --simulations \d+$", first.command)
-    again = sv.risk("results", simulations=int(first.command.split()[-1]))
+    again = sv.risk(
+        "results", simulations=int(first.command.split()[-1]), pool=InlinePool()
+    )
     assert again.to_dict() == first.to_dict()
     with ZipFile("pack.zip") as pack:
         assert b" --simulations " in pack.read("1-wall/answers.json")

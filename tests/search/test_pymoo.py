@@ -24,7 +24,7 @@ from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.support.formulas import carried_out
-from tests.support.in_process import SLOW
+from tests.support.in_process import SLOW, InlinePool
 from tests.support.searches import POPULATION, begun, built, sphere
 from tests.support.standard_problems import PROBLEMS, result_of, standard_problem
 
@@ -150,7 +150,7 @@ def test_an_algorithm_that_leaves_most_of_its_budget_is_named_unless_it_says_so(
     with pytest.warns(
         UserWarning, match="use less than 90% of the simulations that they may use"
     ) as warned:
-        results = run(study, in_tmp / "out", jobs=1)
+        results = run(study, in_tmp / "out", pool=InlinePool())
     counts = results.evaluations.groupby("algorithm").size()
     assert (
         max(counts[name] for name in ("pymoo_PSO", "pymoo_CMAES", "safe_fuzzer"))

@@ -31,6 +31,7 @@ from safevar_sumo.sumo.system import System
 from tests.support.holding import Pedals
 from tests.support.in_process import (
     SLOW,
+    InlinePool,
     json_of,
     own_network,
     run,
@@ -113,7 +114,7 @@ def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(
         title="",
         published={},
     )
-    sv.run(study, out="results/it", jobs=1)
+    sv.run(study, out="results/it", pool=InlinePool())
     engine = read_manifest(Path("results/it"))["engine"]
     assert engine["name"] == "sumo"
     assert "'reacting'" in engine["reason"]

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from safevar_sumo.campaign import all_runs, evaluation, run_campaign
+from safevar_sumo.campaign import all_runs, evaluation, local, run_campaign
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.program import run_command_line
 from safevar_sumo.errors import INTERRUPTS
@@ -87,6 +87,10 @@ def inline_worker(last_words: Path) -> InlinePool:
     return InlinePool()
 
 
+worker_of_commands: Callable[[Path], Any] = inline_worker
+"""Starts a worker of a command that a test runs in this process."""
+
+
 def write(name: str, text: str) -> None:
     """Write a file in the working directory, as a user does."""
     Path(name).write_text(text)
@@ -142,8 +146,9 @@ class CommandOutput(NamedTuple):
 
 
 def run(typed: str, *arguments: str, expect: int | None = 0) -> CommandOutput:
-    """Run a command as a user types it, with further arguments; its exit code must be `expect`,
-    unless that is None. Afterwards, unload modules that it took from the test's folder.
+    """Run a command as a user types it, with further arguments, and its workers in this process;
+    its exit code must be `expect`, unless that is None. Afterwards, unload modules that it took
+    from the test's folder.
     """
     out = io.StringIO()
     err = io.StringIO()
@@ -156,6 +161,7 @@ def run(typed: str, *arguments: str, expect: int | None = 0) -> CommandOutput:
         redirect_stderr(err),
         pytest.MonkeyPatch.context() as patch,
     ):
+        patch.setattr(local, "ProcessWorker", worker_of_commands)
         patch.setattr(sys, "argv", ["safevar-sumo", *shlex.split(typed), *arguments])
         patch.setattr(
             os, "_exit", sys.exit

@@ -1,7 +1,9 @@
-"""Pages of `report` about the study `slippery`."""
+"""Pages of `report` about the study `slippery`, and their words."""
 
 from __future__ import annotations
 
+import html
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -27,3 +29,14 @@ def page_of(
         return report(
             *directories, out=Path(folder, "page.html"), ask=ask, jobs=jobs, **options
         ).read_text(encoding="utf-8")
+
+
+def words_of(page: str) -> str:
+    """The text of a page, between single blanks."""
+    return " ".join(
+        html.unescape(
+            re.sub(
+                "<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL
+            )
+        ).split()
+    )

@@ -263,10 +263,12 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
 
 
 def test_the_study_of_results_is_explained_as_without_results(slippery: Path) -> None:
-    answer = sv.explain(slippery, of_study=True, simulations=600, jobs=1)
+    answer = sv.explain(slippery, of_study=True, simulations=600, pool=InlinePool())
     assert (
         answer.to_dict()
-        == sv.explain(sv.load(slippery).study, simulations=600, jobs=1).to_dict()
+        == sv.explain(
+            sv.load(slippery).study, simulations=600, pool=InlinePool()
+        ).to_dict()
     )
 
 

@@ -14,7 +14,7 @@ from safevar_sumo.questions.permit import permit
 from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.speed_search import Cars
 from safevar_sumo.study import Study
-from tests.support.in_process import SLOW, write
+from tests.support.in_process import SLOW, InlinePool, write
 from tests.support.made_up_studies import places
 
 pytestmark = pytest.mark.usefixtures("made_up_studies")
@@ -77,7 +77,11 @@ def test_a_needed_speed_is_no_less_where_the_new_car_is_unsafe_too() -> None:
 def test_a_car_passes_a_test_of_a_regulation() -> None:
     """It is no promise for the road."""
     told = permit(
-        "r152", cars={"a": {"brakeTorque": 0.9}}, others="new", quick=True
+        "r152",
+        cars={"a": {"brakeTorque": 0.9}},
+        others="new",
+        quick=True,
+        pool=InlinePool(),
     ).verdict
     assert '"a" can pass the test up to 40 km/h' in told
     assert "A new car can pass the test up to 40 km/h" in told

@@ -56,7 +56,7 @@ def gap_for(grip: float) -> float:
 def test_repair_and_price_of_a_planted_system_equal_the_closed_form(
     planted: Path,
 ) -> None:
-    found = sv.repair(planted, change=["gap", "colour"], jobs=2)
+    found = sv.repair(planted, change=["gap", "colour"], pool=InlinePool(2))
     (repair,) = rows_of(found.to_dict(), "repairs")
     needed = max(
         gap_for(5), gap_for(5 * 0.9) - MARGIN

@@ -361,7 +361,7 @@ def test_the_other_parameter_sets_are_planned() -> None:
         study,
         samples=100,
         unsafe="collision",
-        jobs=1,
+        pool=InlinePool(),
         progress=lambda *one: shown.append(one),
     )
     expected = 100 + 12 * 100

@@ -16,7 +16,7 @@ from safevar_sumo.questions.part import UpperEnd, names_left_out, study_up_to
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.support.in_process import SLOW, write
+from tests.support.in_process import SLOW, InlinePool, write
 
 AHEAD = """
 extends = "wear"
@@ -83,7 +83,7 @@ def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_their
             up_to=f"speed={value}",
             characteristics=("brakeTorque",),
             quick=True,
-            jobs=1,
+            pool=InlinePool(),
         )
         for value in (40, 45, 50)
     ]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
-from tests.support.in_process import json_of, refused, rows_of, run, write
+from tests.support.in_process import InlinePool, json_of, refused, rows_of, run, write
 
 SHARES = """
 class Shares:
@@ -188,7 +188,7 @@ def test_a_quick_answer_ends_limits_at_failures_and_keeps_to_what_its_bar_announ
     answer = sv.tolerance(
         "line.toml",
         quick=True,
-        jobs=1,
+        pool=InlinePool(),
         progress=lambda _, done, total: shown.append((done, total)),
     )
     limits = answer.tables["limits"].set_index("characteristic")
