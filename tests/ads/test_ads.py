@@ -34,11 +34,11 @@ from safevar_sumo.study import ModelTable, study_names
 from safevar_sumo.sumo.system import assemble
 from tests.support.holding import CARLA, Hold, driven
 from tests.support.in_process import SLOW
-from tests.support.made_up import MISSING, changed, seen
+from tests.support.made_up import MISSING, changed, seen, system_of
 from tests.support.pedals import BRAKING, COASTING, FULL, KNOWN
-from tests.support.worn import WORN
 
 STEP = 0.05
+WORN = system_of("wear", matrix=None)
 STUDIES = {study.ads.model: study for study in map(read_study, study_names())}
 NATIVE = read_study("native")
 UNAVAILABLE = {read_study(name).ads.model for name in MISSING}

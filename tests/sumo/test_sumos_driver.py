@@ -17,9 +17,9 @@ from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
-from tests.support.controllers import system
 from tests.support.in_process import SLOW, own_network, rewrite
 from tests.support.made_up import changed, original_of, system_of
+from tests.support.user_code import controlled_by
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
 CONTROLLERS = """
@@ -143,7 +143,7 @@ def refuse_difference(
 def test_a_vehicle_without_delays_drives_as_in_bare_sumo(name: str) -> None:
     space = {}
     exec(CONTROLLERS, space)
-    runs = system(name, CONTROLLERS, vehicle=NO_DELAYS)
+    runs = controlled_by(name, CONTROLLERS, vehicle=NO_DELAYS)
     refuse_difference(runs, NET / "traffic.rou.xml", space[name])
 
 
@@ -164,7 +164,7 @@ def test_sumos_driver_has_the_attributes_of_the_traffic_file(
     """All but tau, which the study varies: without delays it drives as in bare SUMO."""
     traffic = with_attributes(in_tmp / "net", f'mass="900" tau="0.3" {attributes}')
     scenario = {"parameters": {"network": str(traffic.parent)}}
-    runs = system("idle", CONTROLLERS, vehicle=NO_DELAYS, scenario=scenario)
+    runs = controlled_by("idle", CONTROLLERS, vehicle=NO_DELAYS, scenario=scenario)
     unused = (
         f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the"
         " study's vehicle and ADS"
@@ -190,14 +190,14 @@ def test_between_two_actions_sumos_driver_asks_for_what_he_decided(
             in_tmp / action, f'sigma="0" actionStepLength="{action}"'
         )
         scenario = {"parameters": {"network": str(traffic.parent)}}
-        runs = system("idle", CONTROLLERS, vehicle=vehicle, scenario=scenario)
+        runs = controlled_by("idle", CONTROLLERS, vehicle=vehicle, scenario=scenario)
         run = drive_worst(runs, original_of(runs))
         assert run.outcome[0] == Outcome.STOPPED
         assert last_gap(run) == pytest.approx(2.5, abs=0.3), "his minGap"
 
 
 def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap() -> None:
-    runs = system("idle", CONTROLLERS)
+    runs = controlled_by("idle", CONTROLLERS)
     run = drive_worst(runs, original_of(runs))
     assert run.outcome[0] == Outcome.STOPPED or run.collision_speed[0] < 3
     assert last_gap(run) < 2  # of the 2.5 m that he wants

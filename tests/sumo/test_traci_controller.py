@@ -13,9 +13,9 @@ import pytest
 from safevar_sumo.records import Outcome
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.traci_commands import CommandedSpeed
-from tests.support.controllers import system
 from tests.support.in_process import SLOW, write
 from tests.support.made_up import changed, original_of
+from tests.support.user_code import controlled_by
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
 
@@ -50,7 +50,7 @@ def step(traci, vehicle_id):
 @SLOW
 def test_a_module_that_imports_traci_reads_the_simulation() -> None:
     write("helper.py", HELPER)
-    runs = system("step", USES_HELPER)
+    runs = controlled_by("step", USES_HELPER)
     assert drive_worst(runs, changed(runs)).trace.speed.max() == pytest.approx(
         5, abs=0.7
     )
@@ -86,7 +86,7 @@ def test_a_controller_reads_other_actors_through_the_sensors() -> None:
         "recognition_delay": 0.1,
         "light": "day",
     }
-    runs = system("step", LOOKS, weather=weather)
+    runs = controlled_by("step", LOOKS, weather=weather)
     trace = drive_worst(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
     leader, x, number, listed = np.loadtxt("looks.csv", delimiter=",")[
         : len(trace.time)
@@ -127,7 +127,7 @@ class Reads:
 
 
 def test_no_function_returns_ids_or_actors_of_other_copies() -> None:
-    runs = system("Reads", SUBSCRIBES)
+    runs = controlled_by("Reads", SUBSCRIBES)
     drive_worst(
         runs, np.repeat(changed(runs, sensorRange=120, reactionTime=0.1), 3, axis=0)
     )
@@ -148,7 +148,7 @@ def test_each_bit_of_a_speed_mode_is_one_limit(mode: int, acceleration: float) -
 
 
 def test_the_vehicle_model_limits_a_commanded_acceleration() -> None:
-    runs = system("Harsh")
+    runs = controlled_by("Harsh")
     run = drive_worst(runs, original_of(runs))
     hardest = -np.diff(run.trace.speed[:, 0]).min() / run.trace.step
     assert 7 < hardest < 9.0  # more than SUMO's driver, who plans with 4.5 m/s^2
