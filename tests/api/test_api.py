@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,6 +16,8 @@ from safevar_sumo.questions.part import at_point
 from safevar_sumo.study import tables_of
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.support.in_process import SLOW, run_python, write
+
+pytestmark = pytest.mark.usefixtures("pools_in_this_process")
 
 
 def test_every_public_name_is_there_and_nothing_else() -> None:
@@ -177,41 +178,15 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
             pd.DataFrame({"mass": ["heavy"]}),
             "row 0: mass = 'heavy'\nexpected: a number",
         ),
-        (
-            [{"mass": 2500.0}, {"mass": [1], "radius": 33}],
-            r"row 1: mass = \[1\]\nexpected: a number",
-        ),
-        ([{"mass": "2500"}], "row 0: mass = '2500'\nexpected: a number"),
-        ("1", "settings: '1'\nexpected: a list of mappings"),
-        ([[1.0, 2.0]], r"shape \(1, 2\)"),
-        ({"mass": [2500.0]}, "'dict'\nexpected: a list of mappings"),
-        ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
         (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"),
         (np.full((1, 17), np.nan), "shape|= nan"),
     ],
 )
-def test_unusable_settings_are_reported_before_any_simulation(
+def test_unusable_frames_are_reported_before_any_simulation(
     settings: object, expected: str
 ) -> None:
     with pytest.raises(sv.InputError, match=expected):
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
-
-
-def test_what_is_wrong_with_an_argument_names_it_and_not_the_file() -> None:
-    for changes, told in (
-        (
-            {"serach": {"runs": 2}},
-            r"rain.toml with serach=...: serach: .* did you mean 'search'",
-        ),
-        (
-            {"search": {"rns": 2}},
-            r"rain.toml with search=...: search.rns: .* did you mean 'runs'",
-        ),
-    ):
-        with pytest.raises(sv.InputError, match=told):
-            sv.load_study("rain", **changes)
-    with pytest.raises(sv.InputError, match=r"mass = '1'\nexpected: a number in"):
-        sv.simulate("rain", {"mass": "1"})  # type: ignore[dict-item]
 
 
 def test_load_reads_the_results_of_run(tmp_path: Path) -> None:
@@ -225,37 +200,6 @@ def test_load_reads_the_results_of_run(tmp_path: Path) -> None:
         pd.read_csv(results.directory / "solutions.csv"),
         check_dtype=False,
     )
-
-
-@SLOW
-@pytest.mark.parametrize(
-    ("options", "error"),
-    [
-        ({"jobs": -1}, "jobs: -1\nexpected: a whole number from 1 to 1,024"),
-        ({"jobs": 0}, "jobs: 0\nexpected: a whole number from 1 to 1,024"),
-        (
-            {"only": [("rs", 0), ("nsga2", 9)]},
-            "only: ('nsga2', 9)\nexpected: (algorithm",
-        ),
-        ({"only": [("sr", 0)]}, "only: ('sr', 0)"),
-        ({"out": ""}, "out: ''"),
-    ],
-)
-def test_a_run_refuses_what_its_command_refuses(
-    options: dict[str, Any], error: str, in_tmp: Path
-) -> None:
-    with pytest.raises(sv.InputError) as refused:
-        sv.run("smoke", **options)
-    assert str(refused.value).startswith(error)
-    assert not [*in_tmp.iterdir()]
-    if "jobs" in options:
-        for ask in (
-            sv.risk,
-            sv.tolerance,
-            lambda study, jobs: sv.evaluate(study, [{}], jobs=jobs),
-        ):
-            with pytest.raises(sv.InputError, match="jobs"):
-                ask("smoke", jobs=options["jobs"])
 
 
 @SLOW

@@ -29,6 +29,7 @@ def is_refused(name: str, values: list[Any], told: str, **options: Any) -> None:
 @pytest.mark.parametrize("row", CALLS["wrong"], ids=str)
 def test_a_wrong_argument_is_named(row: dict[str, Any], in_tmp: Path) -> None:
     is_refused(row["call"], row["values"], row["told"], **row["options"])
+    assert not [*in_tmp.iterdir()]
 
 
 @pytest.mark.parametrize("row", CALLS["of_questions"], ids=str)

@@ -4,8 +4,8 @@ is right elsewhere passes.
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
@@ -104,166 +104,31 @@ STUDY_OF = {
 """A study with user code of each kind."""
 
 
-class Defect(NamedTuple):
-    """A module with a defect: the check that finds it, and a part of what it says."""
-
-    kind: str
-    check: str
-    module: str
-    got: str
-
-
-def planted(
-    kind: str, check_study: str, module: str, where: str, line: str, got: str
-) -> Defect:
-    assert where in module, where
-    return Defect(
-        kind, check_study, module.replace(where, line, 1).replace("BODY", "pass"), got
-    )
-
-
-ALONE, ORDER, AGAIN = (
-    " in a smaller batch, with ",
-    " in another order, with ",
-    " in a second run, with ",
-)
-RUN = "in another run"
-DEFECTS = {
-    "random": planted(
-        "ads", "repetition", SCALAR, "BODY", "stopping += random.random()", AGAIN
-    ),
-    "class variable": planted(
-        "ads",
-        "order",
-        SCALAR,
-        "BODY",
-        "Mine.seen_one = stopping = stopping + 0.01 * Mine.seen_one",
-        ORDER,
-    ),
-    "mean over vehicles": planted(
-        "ads",
-        "alone",
-        ARRAYS,
-        "BODY",
-        "seen = seen._replace(gap=seen.gap + np.mean(seen.speed))",
-        ALONE,
-    ),
-    "place in the batch": planted(
-        "ads",
-        "order",
-        ARRAYS,
-        "BODY",
-        "memory = memory + np.arange(len(seen.speed))",
-        ORDER,
-    ),
-    "out of range": planted(
-        "ads",
-        "contract",
-        SCALAR,
-        "return 0.0, 1.0",
-        "return 0.0, 100.0",
-        "returned brake = 100.0 from drive",
-    ),
-    "vehicle keeps state": planted(
-        "vehicle",
-        "repetition",
-        VEHICLE,
-        "        grip = ",
-        "        self.top_speed *= 0.999\n        grip = ",
-        AGAIN,
-    ),
-    "vehicle maximum": planted(
-        "vehicle",
-        "alone",
-        VEHICLE,
-        "* command.throttle -",
-        "* np.max(state.speed + 1) -",
-        ALONE,
-    ),
-    "scenario with a text": planted(
-        "scenario",
-        "contract",
-        SCENARIO,
-        "self.distance, 0.0",
-        "'far', 0.0",
-        "returned x",
-    ),
-    "scenario beside its speed": planted(
-        "scenario",
-        "contract",
-        SCENARIO,
-        "self.distance, 0.0,",
-        "self.distance + 2 * times, 0.0, -2.0,",
-        "from where its speed takes it",
-    ),
-    "scenario undeclared reaction": Defect(
-        "scenario", "contract", REACTS, "in SUMO, with "
-    ),
-    "metric over runs": planted(
-        "metric",
-        "alone",
-        METRIC,
-        "    return np.max(",
-        "    jerk = jerk - np.mean(jerk)\n    return np.max(",
-        ALONE,
-    ),
-    "metric without a need": planted(
-        "metric",
-        "contract",
-        METRIC,
-        "jerk, 0.0)",
-        "jerk + (trace.gap[2:] < -0.01), 0.0)",
-        "the metric jerk reads gap, which its needs do not state",
-    ),
-    "objective no number": planted(
-        "objective",
-        "contract",
-        OBJECTIVE,
-        "/ characteristics.original",
-        "/ (settings - characteristics.original)",
-        "values = nan",
-    ),
-    "algorithm own random numbers": planted(
-        "algorithm",
-        "repetition",
-        ALGORITHM,
-        "known, original,",
-        "rng = np.random.default_rng()\n        known, original,",
-        RUN,
-    ),
-    "algorithm learns": planted(
-        "algorithm",
-        "repetition",
-        ALGORITHM,
-        "reach *= self.factor",
-        "Mine.reach = reach = reach * 0.5 * getattr(Mine, 'reach', 1)",
-        RUN,
-    ),
-    "algorithm unfiltered": planted(
-        "algorithm",
-        "contract",
-        ALGORITHM,
-        "problem.characteristics.filter(settings)",
-        "settings",
-        "from search",
-    ),
-    "controller module variable": planted(
-        "traci",
-        "repetition",
-        CONTROLLER,
-        "BODY",
-        "calls.append(1); speed += len(calls) / 1e3",
-        AGAIN,
-    ),
-    "controller other vehicle": planted(
-        "traci",
-        "contract",
-        CONTROLLER,
-        "BODY",
-        "traci.vehicle.setSpeed('parked_ahead', 0)",
-        "parked_ahead",
-    ),
+MODULES = {
+    "scalar": SCALAR,
+    "arrays": ARRAYS,
+    "vehicle": VEHICLE,
+    "scenario": SCENARIO,
+    "metric": METRIC,
+    "objective": OBJECTIVE,
+    "algorithm": ALGORITHM,
+    "controller": CONTROLLER,
+    "reacts": REACTS,
 }
+TABLE = Path(__file__).with_name("defects.toml").read_text(encoding="utf-8")
+DEFECTS = {row["name"]: row for row in tomllib.loads(TABLE)["planted"]}
+
+
+def with_defect(name: str) -> str:
+    """The module that has a defect."""
+    defect = DEFECTS[name]
+    module = MODULES[defect["module"]]
+    if "old" in defect:
+        assert defect["old"] in module
+        module = module.replace(defect["old"], defect["new"], 1)
+    return module.replace("BODY", "pass")
+
+
 FAST = ("random", "mean over vehicles", "out of range", "scenario beside its speed")
 
 
@@ -274,14 +139,15 @@ def test_a_planted_defect_is_found_with_the_input_that_shows_it(
     name: str, in_tmp: Path
 ) -> None:
     defect = DEFECTS[name]
-    write("mine.py", defect.module)
-    write("mine.toml", STUDY_OF[defect.kind])
+    module = with_defect(name)
+    write("mine.py", module)
+    write("mine.toml", STUDY_OF[defect["kind"]])
     (finding,) = check_study(study_to_check("mine.toml"))
-    assert finding.check == defect.check, finding
-    assert defect.got in str(finding)
+    assert finding.check == defect["check"], finding
+    assert defect["got"] in str(finding)
     file, _, line = finding.where.rpartition(":")
     assert Path(file).resolve() == (in_tmp / "mine.py").resolve()
-    assert 1 <= int(line) <= len(defect.module.splitlines())
+    assert 1 <= int(line) <= len(module.splitlines())
 
 
 @pytest.mark.parametrize(
@@ -385,7 +251,7 @@ def test_a_driving_system_that_does_not_end_is_a_finding_in_time(
 
 
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
-    write("mine.py", DEFECTS["out of range"].module)
+    write("mine.py", with_defect("out of range"))
     write("mine.toml", STUDY_OF["ads"])
     answer = json_of("check mine.toml", expect=1)
     assert answer["numbers"]["passed"] is False
