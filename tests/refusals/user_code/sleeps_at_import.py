@@ -1,0 +1,3 @@
+import time
+
+Mine = time.sleep(60)
