@@ -31,6 +31,7 @@ from tests.support.in_process import (
     searched,
 )
 from tests.support.made_up import FITS, system_of
+from tests.support.report_pages import draw_few_frames
 
 collect_ignore = (
     []
@@ -111,6 +112,11 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     allow_few_simulations(monkeypatch)
+
+
+@pytest.fixture
+def few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw_few_frames(monkeypatch)
 
 
 @pytest.fixture(params=EVERY_STUDY)

@@ -256,10 +256,11 @@ def still(in_tmp: Path) -> str:
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_every_command_begins_with_the_reason(still: str) -> None:
     for command in (
         f"rules {still} --samples 32 --unsafe collision",
-        f"explain {still}",
+        f"explain {still} --quick",
         f"simulate {still} --set mass=2600",
     ):
         assert run(command).stdout.startswith(STANDS)

@@ -5,10 +5,14 @@ from __future__ import annotations
 import html
 import re
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from safevar_sumo.report import report
+import pytest
+
+from safevar_sumo.replay.animation import player_of
+from safevar_sumo.report import replays, report
 
 ASK = (
     "tolerance --fits 0 --characteristics tireFric,mass",
@@ -16,6 +20,11 @@ ASK = (
     "risk --samples 400",
     "rules --samples 400",
 )
+
+
+def draw_few_frames(patch: pytest.MonkeyPatch) -> None:
+    """Replays on pages have two frames, which are drawn in a twentieth of the time."""
+    patch.setattr(replays, "player_of", partial(player_of, frames=2))
 
 
 def page_of(
