@@ -119,7 +119,7 @@ def _create_locked(file: Path) -> IO[bytes] | None:
     """Create a temporary file, and lock it until it is closed. None if another process removed the
     file before it was locked, because it looked like a file that a killed process has left.
     """
-    stream = open(file, "xb")  # noqa: SIM115
+    stream = open(file, "xb")  # noqa: SIM115 - the caller closes it
     # On Windows, a lock would also prevent this process from writing.
     if os.name != "nt":
         # This process waits for the lock while another process removes the file. Some file systems

@@ -80,7 +80,7 @@ class ProcessWorker:
         (self._process,) = self._executor._processes.values()  # noqa: SLF001 - no public name
         # If a process dies while it sends a result, the reader waits for the rest until all writers
         # are closed. This process holds a writer, too: without the call it would wait for ever.
-        self._executor._result_queue._writer.close()  # type: ignore[attr-defined]  # noqa: SLF001
+        self._executor._result_queue._writer.close()  # type: ignore[attr-defined]  # noqa: SLF001 - no public name
 
     def submit(self, function: Work, *arguments: Any) -> Future[Any]:
         return self._executor.submit(function, *arguments)
@@ -138,7 +138,7 @@ def _begin_work(path: ImportPath, last_words: Path, mark: str) -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [CLOSING_SIGNAL])
     # The pool removes this folder at its end. A killed worker could not remove its own files.
     tempfile.tempdir = str(last_words.parent)
-    file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
+    file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115 - closed with the process
     faulthandler.enable(file=file, all_threads=False)
     this_process.last_words = file
     this_process.worker = int(last_words.stem)

@@ -70,7 +70,7 @@ def _import_matplotlib() -> None:
         # Figures of this package need no window, and no other backend than this one.
         variables = {"MATPLOTLIBRC": defaults, "MPLBACKEND": "agg"}
         with temporary_entries(os.environ, variables):
-            import matplotlib  # noqa: F401
+            import matplotlib  # noqa: F401 - it reads `defaults`
 
 
 def new_figure(
