@@ -46,14 +46,22 @@ CLAIMS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int, str]] = {
     "wear": (
         "wear",
         {"matrix": FEW_TESTS},
-        {"limits": ("treadDepth >= 3",), "fits": 2},
+        {
+            "limits": ("treadDepth >= 3",),
+            "fits": 2,
+            "characteristics": ("treadDepth,brakeTorque,brakeResponse",),
+        },
         600,
         "at 3 mm or more",
     ),
     "a metric, worst in a matrix": (
         "wear",
         {"matrix": FEW_TESTS},
-        {"unsafe": Unsafe.parse("drac > 8"), "fits": 2},
+        {
+            "unsafe": Unsafe.parse("drac > 8"),
+            "fits": 2,
+            "characteristics": ("treadDepth,brakeTorque,brakeResponse",),
+        },
         600,
         "in 2 of 2 parameter sets",
     ),
