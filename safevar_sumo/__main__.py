@@ -51,13 +51,13 @@ def _filter_warnings() -> None:
     os.environ.pop("PYTHONWARNINGS", None)
     sys.warnoptions.clear()
     warnings.resetwarnings()
-    for_developers = (
+    developer_warnings = (
         DeprecationWarning,
         PendingDeprecationWarning,
         ImportWarning,
         ResourceWarning,
     )
-    for category in for_developers:
+    for category in developer_warnings:
         warnings.simplefilter("ignore", category)
 
 

@@ -16,7 +16,9 @@ from types import FrameType
 from typing import Any
 
 MAX_JOBS = 1024
-"""Largest number of worker processes."""
+"""Largest number of worker processes: more than any machine has cores, so that a larger number is a
+slip of the pen.
+"""
 INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C: 128 plus the number of the signal, as in shells."""
 INTERRUPTS = tuple(
@@ -32,6 +34,15 @@ with which batch systems announce the end of a job. Windows has the first two al
 def in_main_thread() -> bool:
     """Whether this is the main thread, which alone may set handlers of signals."""
     return threading.current_thread() is threading.main_thread()
+
+
+def settable_interrupts() -> tuple[signal.Signals, ...]:
+    """The signals of `INTERRUPTS` whose handlers this thread may set; none in other threads than
+    the main thread.
+    """
+    if in_main_thread():
+        return INTERRUPTS
+    return ()
 
 
 CONTROLS = re.compile(
@@ -245,7 +256,7 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
 
 def one_of(names: Iterable[str]) -> str:
     """The text `one of` with all legal names, for an error; `none` if no name is legal."""
-    listed = ", ".join(sorted(names))
-    if listed:
-        return f"one of {listed}"
+    text = ", ".join(sorted(names))
+    if text:
+        return f"one of {text}"
     return "none"

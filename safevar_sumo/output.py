@@ -183,14 +183,11 @@ def file_beside(text: str, folders: Sequence[str]) -> str:
     exists.
     """
     try:
-        return next(
-            (
-                os.path.abspath(path)
-                for folder in folders
-                if (path := Path(folder, text)).is_file()
-            ),
-            "",
-        )
+        for folder in folders:
+            path = Path(folder, text)
+            if path.is_file():
+                return os.path.abspath(path)
     except (OSError, ValueError):
         # A text that is no legal path names no file.
         return ""
+    return ""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from threading import Event, Thread
+from typing import NamedTuple
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.measure import Measurement
@@ -40,25 +41,31 @@ UNLIMITED_WIDTH = 1_000_000
 """A width at which no line is broken [characters]."""
 
 
+class ColumnOfTexts(NamedTuple):
+    """A column of a `WholeTable`: its head, whether it holds numbers, and its cells."""
+
+    head: str
+    is_number: bool
+    texts: Sequence[str]
+
+
 class WholeTable(Table):
     """A table of plain text in which nothing is cut off.
 
     In a narrow terminal, the table first breaks lines between words, then omits the padding, and
-    last breaks words. A column has a head, a truth value (whether it holds numbers), and its cells.
+    last breaks words.
     """
 
-    def __init__(
-        self, title: str, columns: Iterable[tuple[str, bool, Sequence[str]]]
-    ) -> None:
+    def __init__(self, title: str, columns: Sequence[ColumnOfTexts]) -> None:
         super().__init__()
         self._title_line = printable_text(title, "italic")
-        heads, are_numbers, cells = zip(*columns, strict=True)
-        for head, is_number in zip(heads, are_numbers, strict=True):
+        for column in columns:
             self.add_column(
-                printable_text(head), justify="right" if is_number else "left"
+                printable_text(column.head),
+                justify="right" if column.is_number else "left",
             )
-        for row in zip(*cells, strict=True):
-            self.add_row(*map(printable_text, row))
+        for row in zip(*[column.texts for column in columns], strict=True):
+            self.add_row(*[printable_text(cell) for cell in row])
 
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
@@ -68,8 +75,9 @@ class WholeTable(Table):
         if self._title_line:
             yield self._title_line
 
-        # For each column: the width of its longest word, and the width of its longest text.
-        sizes = []
+        # The width of the longest word of each column, and the width of its longest text.
+        word_widths = []
+        text_widths = []
         count = len(self.columns)
         for column in self.columns:
             cells = (column.header, *column.cells)
@@ -77,23 +85,25 @@ class WholeTable(Table):
                 Measurement.get(console, options.update(width=UNLIMITED_WIDTH), cell)
                 for cell in cells
             ]
-            sizes.append(tuple(map(max, zip(*measures, strict=True))))
+            word_widths.append(max(measure.minimum for measure in measures))
+            text_widths.append(max(measure.maximum for measure in measures))
             column.overflow = "fold"
 
         # If the table is too wide, columns share the space that the longest words leave.
-        words, texts = map(sum, zip(*sizes, strict=True))
+        words = sum(word_widths)
+        texts = sum(text_widths)
         space = options.max_width - count - 1
         if texts + 2 * count > space:
             spare = space - words - 2 * count
             if spare < 0:
                 self.padding = 0
                 spare += 2 * count
-            for column, (longest_word, full_width) in zip(
-                self.columns, sizes, strict=True
+            for column, word_width, text_width in zip(
+                self.columns, word_widths, text_widths, strict=True
             ):
                 if spare >= 0:
-                    share = (full_width - longest_word) * spare // max(texts - words, 1)
-                    column.width = longest_word + share
+                    share = (text_width - word_width) * spare // max(texts - words, 1)
+                    column.width = word_width + share
         yield from super().__rich_console__(console, options)
 
 
@@ -101,7 +111,8 @@ def printable_text(text: object, style: str = "") -> Text:
     """Convert text for rich. White space becomes a space, and any other unprintable character a
     question mark.
     """
-    return Text("".join(map(_printable_letter, str(text))), style)
+    letters = [_printable_letter(letter) for letter in str(text)]
+    return Text("".join(letters), style)
 
 
 def _printable_letter(letter: str) -> str:
@@ -168,14 +179,14 @@ class Pace:
 
     def update(self, number: int, total: int) -> None:
         """Note how much work is done now, and how much work the command has."""
-        now = time.monotonic()
+        time_now = time.monotonic()
         if not self._marks or number < self._marks[-1][1]:
             self._marks.clear()
-            self._begin = now
-        self._marks.append((now, number))
+            self._begin = time_now
+        self._marks.append((time_now, number))
         self._left = total - number
-        while len(self._marks) > 2 and self._marks[1][0] < now - MEASURED_SHARE * (
-            now - self._begin
+        while len(self._marks) > 2 and self._marks[1][0] < time_now - MEASURED_SHARE * (
+            time_now - self._begin
         ):
             self._marks.popleft()
 
@@ -238,9 +249,8 @@ def open_progress(
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
-            print_text(
-                console, ", ".join(filter(None, (line, str(time_left.render()))))
-            )
+            parts = (line, str(time_left.render()))
+            print_text(console, ", ".join(part for part in parts if part))
 
     text = TextColumn("{task.description}", markup=False)
     count = TextColumn("{task.fields[count]}", markup=False)

@@ -277,7 +277,9 @@ class DelayLine(NamedTuple):
         Until the first values are one delay old, `delayed` returns the first values. If a value is
         infinite in one of the two steps, no mean is defined: the value of the earlier step holds.
         """
-        past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
+        # Before the first call, all past values count as equal to the first values.
+        earlier_past = self.past or (values,) * (self.steps + 2)
+        past = (*earlier_past[1:], values)
         older = past[0]
         newer = past[1]
         delayed = newer

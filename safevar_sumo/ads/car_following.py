@@ -116,8 +116,8 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
         )
         gap_error = gap - self.standing_gap - standing_distance - self.headway * speed
         closing, keeping, avoiding = (
-            by_speed * relative_speed + by_gap * gap_error
-            for by_speed, by_gap in (CLOSING_GAINS, KEEPING_GAINS, AVOIDING_GAINS)
+            speed_gain * relative_speed + gap_gain * gap_error
+            for speed_gain, gap_gain in (CLOSING_GAINS, KEEPING_GAINS, AVOIDING_GAINS)
         )
         keeps_gap = (np.abs(gap_error) < GAP_TOLERANCE) & (
             np.abs(excess_speed) < SPEED_TOLERANCE

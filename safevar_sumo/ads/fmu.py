@@ -242,9 +242,7 @@ class FmuAds(ScalarAds):
             if result and any(result[1:3]):
                 raise RuntimeError("it ends the simulation or returns early")
             return {
-                name: getattr(slave, f"get{variable.type}")([variable.valueReference])[
-                    0
-                ]
+                name: read(slave, variable)
                 for name, variable in self._fmu.outputs.items()
             }
         # FMPy may raise any exception. After a failure, FMI forbids further calls of the instance:
@@ -252,6 +250,12 @@ class FmuAds(ScalarAds):
         except Exception as error:
             self._end.detach()
             raise RuntimeError(f"{str(error).splitlines()[0]} at {time:g} s") from None
+
+
+def read(slave: Any, variable: Any) -> Any:
+    """The value of a real variable of an FMU's instance."""
+    (value,) = getattr(slave, f"get{variable.type}")([variable.valueReference])
+    return value
 
 
 def write(slave: Any, variable: Any, value: float) -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from functools import reduce
 from typing import Any
 
 from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way, library
@@ -17,7 +16,7 @@ from safevar_sumo.shipped import shipped_table
 ROLLING_OUT = 1.0
 """Deceleration after a demand to brake, while somebody is in the way [m/s^2]: assumption."""
 
-MOST = 1000.0
+MAX_NUMBER = 1000.0
 """Largest number of the rule that the library takes."""
 
 
@@ -66,7 +65,7 @@ class AdRss(ScalarAds):
             "brake_min": brake_min,
         }
         for name, value in sizes.items():
-            upper_limit = brake_max if name == "brake_min" else MOST
+            upper_limit = brake_max if name == "brake_min" else MAX_NUMBER
             if not 0 <= value <= upper_limit or (value == 0 and name != "accel_max"):
                 raise InputError(
                     "",
@@ -81,7 +80,8 @@ class AdRss(ScalarAds):
         self.cruise_speed = cruise_speed
         self.corridor = corridor
         self.has_braked = False
-        # They warn of converters that both modules register; the first has types of the second.
+        # Both modules register the same converters, of which Python would warn. The types of
+        # ad_physics must be known when ad_rss is loaded.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             library("ad_rss", "ad-rss", "ad_physics")
@@ -103,7 +103,7 @@ class AdRss(ScalarAds):
         if self.has_braked:
             if is_blocked:
                 return self.pedals(-ROLLING_OUT, observation.speed)
-            return (0.0, 0.0)
+            return 0.0, 0.0
         return self.pedals(self.cruise_speed - observation.speed, observation.speed)
 
 
@@ -126,17 +126,17 @@ class _Rule:
             "alpha_lon.brake_max": -driver.brake_max,
             "min_longitudinal_safety_distance": driver.min_longitudinal_safety_distance,
         }
-        dynamics = filled(
+        dynamics = fill(
             self._rss.world.RssDynamics(), {**tables["dynamics"], **self._rule}
         )
         self._situation = self._rss.core.RssSituationSnapshot()
         self._situation.default_ego_vehicle_rss_dynamics = dynamics
 
         # The ego vehicle is behind another one in the same direction, in its way.
-        self._pair = filled(self._rss.core.RelativeConstellation(), tables["pair"])
+        self._pair = fill(self._rss.core.RelativeConstellation(), tables["pair"])
         for state in (self._pair.ego_state, self._pair.other_state):
             state.dynamics = dynamics
-            filled(state, tables["object"])
+            fill(state, tables["object"])
 
     def demands_braking(self, speed: float, gap: float, leader_speed: float) -> bool:
         """Whether the library demands longitudinal braking at a speed [m/s] and a gap [m] behind a
@@ -177,13 +177,16 @@ class _Rule:
         return bool(response.longitudinal_response.name != "None")
 
 
-def filled(target: Any, values: Mapping[str, Any]) -> Any:
-    """An object of the library after its attributes, by their dotted names, got these values."""
+def fill(target: Any, values: Mapping[str, Any]) -> Any:
+    """Give values to the attributes of an object of the library, by their dotted names, and return
+    the object. A text is the name of a member of an enumeration.
+    """
     for path, value in values.items():
-        *owners, name = path.split(".")
-        owner = reduce(getattr, owners, target)
+        *parents, name = path.split(".")
+        owner = target
+        for parent in parents:
+            owner = getattr(owner, parent)
         kind = type(getattr(owner, name))
-        setattr(
-            owner, name, getattr(kind, value) if isinstance(value, str) else kind(value)
-        )
+        converted = getattr(kind, value) if isinstance(value, str) else kind(value)
+        setattr(owner, name, converted)
     return target

@@ -195,7 +195,7 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
         )
 
         is_creeping = has_begun_to_stop & (speed < self.creep_speed + CREEP_MARGIN)
-        creeping_time = memory.creeping_time + memory.step * is_creeping
+        creeping_time = memory.creeping_time + np.where(is_creeping, memory.step, 0.0)
         acceleration[is_creeping] = 0.0
         acceleration[creeping_time > self.creep_time] = -HOLDING_DECELERATION
         return memory._replace(

@@ -254,7 +254,8 @@ class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
 
         # Without a danger the driver holds the cruise speed. A driver that is aware of a cause does
         # not accelerate.
-        if (step_index := round(observation.time / memory.step)) < len(start):
+        step_index = round(observation.time / memory.step)
+        if step_index < len(start):
             calm = Command(
                 np.full_like(observation.speed, start[step_index]),
                 np.zeros_like(observation.speed),

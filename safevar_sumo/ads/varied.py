@@ -92,5 +92,5 @@ def with_tau(ads: Ads, tau: FloatArray | None) -> Ads:
     if tau is None or not ads.tau_parameter:
         return ads
     if not isinstance(ads, VariedAds):
-        return VariedAds(ads, (ads.tau_parameter,), tau[:, None])
+        return VariedAds(ads, (ads.tau_parameter,), tau[:, np.newaxis])
     return ads.with_another(ads.tau_parameter, tau)

@@ -13,7 +13,7 @@ from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.errors import InputError, about, check_name
 from safevar_sumo.questions.arguments import checked
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import evaluations_frame
+from safevar_sumo.results import NO_RUN, evaluations_frame
 from safevar_sumo.study import Study, StudyLike, plain_values
 from safevar_sumo.terminal import Progress, open_progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
@@ -29,7 +29,7 @@ SETTINGS_FORMAT = (
     " characteristic that is changed, or an array of numbers, shape (M, n)"
 )
 SETTINGS = "settings"
-"""The name of the phase of progress."""
+"""The argument with the settings, for errors. The phase of progress has the same name."""
 
 
 @checked
@@ -95,7 +95,7 @@ def evaluate(
     if filtered:
         simulated = characteristics.filter(simulated)
     if not beyond:
-        with about("settings"):
+        with about(SETTINGS):
             system.region.check(simulated, otherwise=", or any with beyond=True")
     with open_progress(progress) as report_progress:
         evaluations = evaluate_with_workers(
@@ -103,9 +103,8 @@ def evaluate(
         )
 
     # The frame has columns for an algorithm and its run, which these evaluations do not have.
-    frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(
-        columns=["algorithm", "run"]
-    )
+    frame = evaluations_frame(characteristics.names, [(NO_RUN, evaluations)])
+    frame = frame.drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     scoring = system.measuring.scoring
     if scoring.safe_original is not None:
@@ -126,6 +125,7 @@ def evaluate_with_workers(
     from safevar_sumo.questions.evaluator import open_evaluator
 
     with open_evaluator(study, pool, jobs, progress) as evaluator:
+        # The only phase is the whole progress, whatever its number of settings.
         evaluator.begin({SETTINGS: 1})
         return evaluator.evaluate(settings, SETTINGS, ignore_constraints=True)
 
@@ -151,7 +151,7 @@ def _read_settings(
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
         kind = type(settings).__name__
-        raise InputError("settings", f"a {kind}: {error}", SETTINGS_FORMAT) from None
+        raise InputError(SETTINGS, f"a {kind}: {error}", SETTINGS_FORMAT) from None
 
     are_legal = [
         characteristic.is_legal(values, beyond=beyond)
@@ -208,6 +208,7 @@ def _check_numbers(name: str, column: pd.Series) -> None:
     """Refuse a column with a value that is neither a number nor missing, such as a list or a
     text.
     """
+    # A column of floats, of integers or of unsigned integers has nothing else.
     if column.dtype.kind in "fiu":
         return
     for row, value in enumerate(column):

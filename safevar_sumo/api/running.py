@@ -97,7 +97,8 @@ def run(
             retry_failed=retry_failed,
         )
     results = load(directory)
-    if remark := why_few_evaluations(results.case):
+    remark = why_few_evaluations(results.case)
+    if remark:
         warn(remark)
     return results
 

@@ -250,7 +250,9 @@ class Simulation:
         """
         criterion = self.pair.system.criterion
         runs = runs_in_words(criterion.failing_runs(self.evaluation)[:, 0])
-        return " and ".join(filter(None, (self._ending, runs)))
+        if runs:
+            return f"{self._ending} and {runs}"
+        return self._ending
 
     @property
     def _ending(self) -> str:
@@ -347,7 +349,9 @@ def simulate(
         setting = system.characteristics.setting(changes, beyond=beyond)
         if not beyond:
             simulated = system.characteristics.filter(setting) if filtered else setting
-            system.region.check(simulated[None], otherwise=", or any with beyond=True")
+            system.region.check(
+                simulated[np.newaxis], otherwise=", or any with beyond=True"
+            )
     return simulate_with_original(
         loaded_study, where_met(system, setting), setting, filtered=filtered
     )
@@ -389,16 +393,18 @@ def simulate_with_original(
     is_original = np.array_equal(original, setting)
     settings = np.stack([original] if is_original else [original, setting])
     point = worst_point(system, setting)
-    at_point = system.at(point)
+    point_system = system.at(point)
     observations = []
     runs = drive_all(
-        replace(at_point, in_sumo=True),
+        replace(point_system, in_sumo=True),
         settings,
         lambda values: observations.append(
             Observation._make(np.copy(value) for value in values)
         ),
     )
-    pair = Pair(point, at_point, runs, score(at_point, settings, runs), observations)
+    pair = Pair(
+        point, point_system, runs, score(point_system, settings, runs), observations
+    )
 
     values = zip(
         characteristics.names,

@@ -32,7 +32,7 @@ from safevar_sumo.questions.research_questions.comparisons import titles_of
 from safevar_sumo.questions.research_questions.tables import TABLES
 from safevar_sumo.questions.sentence import Sentence, Verdict
 from safevar_sumo.questions.subject import Results, load
-from safevar_sumo.questions.tables import Rows, shipped_columns
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import (
     ALREADY_UNSAFE,
     EXACT,
@@ -63,7 +63,10 @@ adds this number to the simulations of the search.)
 """
 VERDICT_SIMULATIONS = 60
 """Number of simulations that the verdict takes in a simulator of the user's own, roughly."""
-ALGORITHMS, CHANGES = shipped_columns("study").values()
+ALGORITHMS = shipped_columns("study")["algorithms"]
+"""The columns of the table with a row for each search algorithm."""
+CHANGES = shipped_columns("study")["fewest"]
+"""The columns of the table with the changes of the vehicle with the fewest changes."""
 MAX_LISTED = 3
 """Largest number of changes that the verdict lists; the table lists all changes."""
 RUN_TESTS = ("rq1-runs", "rq2-runs")
@@ -234,10 +237,11 @@ def _found(
             "a smaller scenario.margin, or original values of the axes with which the"
             " original vehicle is safe, as questions demand"
         )
-    changes: Rows = []
+    changes: list[JsonObject] = []
     if system.meets_nobody and not (unsafe or results.study.unsafe.criterion):
         advice = ""
-    if breach := _breach_of_original(case):
+    breach = _breach_of_original(case)
+    if breach:
         sentences = [ALREADY_UNSAFE(breach=breach)]
         advice = ""
     else:
@@ -268,8 +272,10 @@ def directory_name(study: Study) -> str:
     searched.
     """
     origin = study.origin
-    parts = (study.name, "ranges" * origin.ranges, origin.point, origin.up_to)
-    return re.sub(r"[^A-Za-z0-9_.=-]+", "_", "-".join(part for part in parts if part))
+    ranges = "ranges" if origin.ranges else ""
+    parts = (study.name, ranges, origin.point, origin.up_to)
+    name = "-".join(part for part in parts if part)
+    return re.sub(r"[^A-Za-z0-9_.=-]+", "_", name)
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
@@ -312,7 +318,7 @@ def _breach_of_original(case: Case) -> str:
 
 def _verdict(
     results: Results, case: Case, jobs: int | None, study: str
-) -> tuple[list[Sentence], Rows]:
+) -> tuple[list[Sentence], list[JsonObject]]:
     """The verdict on a case: how many solutions are unsafe, and how few changes suffice. The rows
     of `CHANGES` list the changes of the vehicle with the fewest changes.
     """
@@ -333,10 +339,11 @@ def _verdict(
         ),
         *notes_on(unsafe, *demanded_in_words(results.study)),
     ]
-    if failed := len(case.failures):
-        vehicles = number_of(failed, "vehicle")
+    if len(case.failures):
+        vehicles = number_of(len(case.failures), "vehicle")
         sentences.append(words.NOT_SIMULATED(failed=vehicles))
-    if standing := number_standing(results):
+    standing = number_standing(results)
+    if standing:
         vehicles = number_of(standing, "simulated vehicle")
         sentences.append(words.NEVER_MOVED(vehicles=vehicles))
     fewest = fewest_changes(case, jobs)
@@ -350,11 +357,18 @@ def _verdict(
     if not count:
         template = words.ORIGINAL_UNSAFE
     command = replay_command(str(results.directory))
-    rows = []
+    rows: list[JsonObject] = []
     for item in members:
         value = values[item.name]
         if value != item.original:
-            rows.append((item.name, item.unit, item.original, value))
+            rows.append(
+                {
+                    "characteristic": item.name,
+                    "unit": item.unit,
+                    "original": item.original,
+                    "value": value,
+                }
+            )
             command += f" --set {item.name}={value:{EXACT}}"
     sentences += [
         template(
@@ -392,28 +406,28 @@ def summarise(results: Results) -> Answer:
         metric.name: Column(metric.unit, "mean over solutions", ".2f", is_detail=True)
         for metric in case.scoring.metrics
     }
+    all_simulated = results.evaluations
+    all_solutions = results.solutions
     finished = case.run_counts
     rows = []
     for name in study.search.labels:
-        simulated, solutions = (
-            frame[frame["algorithm"] == name]
-            for frame in (results.evaluations, results.solutions)
-        )
+        simulated = all_simulated[all_simulated["algorithm"] == name]
+        solutions = all_solutions[all_solutions["algorithm"] == name]
         outcomes = Counter(simulated["outcome"])
         feasible = simulated[case.scoring.feasible_rows(simulated)]
         rows.append(
-            (
-                name,
-                finished[name],
-                study.search.runs,
-                len(simulated),
-                int(are_collisions(feasible).sum()),
-                outcomes[Outcome.INVALID_TEST],
-                outcomes[Outcome.SIMULATOR_ERROR],
-                feasible["f_safe"].min(),
-                len(solutions),
-                *solutions[list(metrics)].mean(),
-            )
+            {
+                "algorithm": name,
+                "finished": finished[name],
+                "runs": study.search.runs,
+                "simulated": len(simulated),
+                "collisions": int(are_collisions(feasible).sum()),
+                "invalid_tests": outcomes[Outcome.INVALID_TEST],
+                "simulator_errors": outcomes[Outcome.SIMULATOR_ERROR],
+                "best": feasible["f_safe"].min(),
+                "solutions": len(solutions),
+                **solutions[list(metrics)].mean(),
+            }
         )
 
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
@@ -422,17 +436,18 @@ def summarise(results: Results) -> Answer:
     # If no test can be significant with so few runs, its table is folded, with a remark.
     untested = []
     with suppress(UnanswerableError):
-        of_runs = answer_questions([case], names=RUN_TESTS).tables
-        tables |= of_runs.records
+        run_tables = answer_questions([case], names=RUN_TESTS).tables
+        tables |= run_tables.records
         untested = [
-            name for name in RUN_TESTS if not of_runs[name]["enough_runs"].any()
+            name for name in RUN_TESTS if not run_tables[name]["enough_runs"].any()
         ]
         # The first remark of such a table says how many runs are needed.
-        if few := " ".join(
-            next(remarks_on_runs(name, of_runs[name]), "") for name in untested
-        ):
-            remarks = of_runs["remarks"]
-            remarks.loc[len(remarks)] = ["all", few]
+        remark = " ".join(
+            next(remarks_on_runs(name, run_tables[name]), "") for name in untested
+        )
+        if remark:
+            remarks = run_tables["remarks"]
+            remarks.loc[len(remarks)] = ["all", remark]
     runs = study.search.runs * len(rows)
     return Answer(
         question="study",

@@ -35,7 +35,7 @@ from safevar_sumo.campaign.evaluation import (
     verify_settings,
 )
 from safevar_sumo.campaign.inputs import files_of, manifest_now, refuse_changed_inputs
-from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.pool import Pool, Spare
 from safevar_sumo.campaign.share import MAX_SKIPPED
 from safevar_sumo.campaign.user_checks import check_code
 from safevar_sumo.errors import InputError, UserCodeError, warn
@@ -92,13 +92,15 @@ def _refuse_other_workers(study: Study, used: Iterable[str], pool: Pool) -> None
         pool.on_cluster(refuse_other_worker, study, manifest, package_digest())
 
 
-def spare(limit: int, minimum: int) -> tuple[int, int]:
-    """Split the simulations that are not needed for an answer. Return how many simulations the
-    check of a simulator's class may take, and how many the repetition of first batches may take.
-    `limit` is the number of allowed simulations, `minimum` the least number for an answer.
+def spare(limit: int, minimum: int) -> Spare:
+    """Split the simulations that are not needed for an answer. `limit` is the number of allowed
+    simulations, `minimum` the least number for an answer.
     """
-    check = min(limit // 10, max(limit - minimum, 0))
-    return check, min(limit // 10, MAX_REPEATS, max(limit - minimum - check, 0))
+    # Each check takes at most a tenth, so that most simulations are left for the answer.
+    share = limit // 10
+    check = min(share, max(limit - minimum, 0))
+    repetition = min(share, MAX_REPEATS, max(limit - minimum - check, 0))
+    return Spare(check, repetition)
 
 
 def evaluate_all(
@@ -169,7 +171,8 @@ def _evaluate_unshared(
         key = b""
         if cache:
             key = key_of_settings(cache.key_of(study, opened), selection, portion)
-            if cached := evaluations_in(cache.get(key)):
+            cached = evaluations_in(cache.get(key))
+            if cached:
                 evaluated.append(cached)
                 finish(len(portion))
                 continue
@@ -227,7 +230,8 @@ def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
     kept.
     """
     opened = opened_by(study, pool)
-    if cache := cache_of(study, opened):
+    cache = cache_of(study, opened)
+    if cache:
         key = hashlib.sha256(b"original" + cache.key_of(study, opened)).digest()
         cached = evaluations_in(cache.get(key))
         if cached is not None and list(differences(cached.results, original.results)):
@@ -243,7 +247,9 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
     raise the error of `repeat_first_batch`.
     """
     if user_code_names(study):
-        limit = pool.spare and pool.spare[1] // simulations_of_setting(system_of(study))
+        limit = None
+        if pool.spare is not None:
+            limit = pool.spare.repetition // simulations_of_setting(system_of(study))
         pool.everywhere(repeat_first_batch, study, home=home_of(study), limit=limit)
 
 
@@ -257,7 +263,8 @@ def opened_by(study: Study, pool: Pool) -> list[str]:
         if names <= checked_names and folders == places:
             return opened
     _refuse_other_workers(study, [], pool)
-    pool.opened[names, places] = opened = check_code(study, pool)
+    opened = check_code(study, pool)
+    pool.opened[names, places] = opened
     return opened
 
 
@@ -272,14 +279,12 @@ def _simulate(
     """Simulate distinct settings, shape (k, n), in batches. If recorded scenes replace SUMO,
     simulate a sample of `sample_size` settings again in SUMO.
     """
-    jobs = [
-        (task, rows)
-        for rows in np.array_split(settings, batches.number(len(settings), pool))
-    ]
+    parts = np.array_split(settings, batches.number(len(settings), pool))
+    jobs = [(task, part) for part in parts]
 
     def show_ended(ended: Sequence[int]) -> None:
         for number in ended:
-            finish(len(jobs[number][1]))
+            finish(len(parts[number]))
 
     evaluations = Evaluations.concatenate(
         carry_out(evaluate_settings, jobs, pool, show_ended)

@@ -209,23 +209,23 @@ class CommandCache:
         self._lock: portalocker.Lock | None = None
         self._own: Cache | None = None
         self._own_folder: Path | None = None
-        self._of_everybody = Cache(folder, is_read=not is_fresh)
+        self._common = Cache(folder, is_read=not is_fresh)
 
     def of(self, study: Study, opened: Sequence[str]) -> Cache | None:
         """The cache for the simulations of a study; None if another process runs the same command
         with the same code. `opened` are the names of the files that the study's user code opens.
         """
         if not user_code_names(study):
-            return self._of_everybody
+            return self._common
         if self._own_folder is None:
-            self._open_own(self._of_everybody.key_of(study, opened))
+            self._open_own(self._common.key_of(study, opened))
         return self._own
 
     def end(self, *, is_interrupted: bool) -> None:
         """Close the caches. Unless the command was interrupted, remove the cache of its user
         code.
         """
-        self._of_everybody.close()
+        self._common.close()
         if self._own is not None and self._own_folder is not None:
             self._own.close()
             if not is_interrupted:
@@ -258,9 +258,12 @@ class CommandCache:
         if self._own_folder.is_dir():
             begin = self._own_folder.stat().st_mtime
         self._own = Cache(self._own_folder, is_counted=True)
-        if begin is not None and (number := self._own.number_kept()):
-            at = time.strftime("%H:%M", time.localtime(begin))
-            hint(f"continues: {number:,} simulated at {at}")
+        if begin is None:
+            return
+        number = self._own.number_kept()
+        if number:
+            clock = time.strftime("%H:%M", time.localtime(begin))
+            hint(f"continues: {number:,} simulated at {clock}")
 
     def _remove_old(self) -> None:
         """Remove caches into which nobody has written for a day, because no command continues from

@@ -105,9 +105,9 @@ def run_campaign(
         study,
         manifest_now(study, system, read),
         system.measuring.scoring,
-        list(map(str, keys)),
+        [str(key) for key in keys],
     )
-    for remark in results.extent_remarks(set(map(str, all_runs(study)))):
+    for remark in results.extent_remarks({str(key) for key in all_runs(study)}):
         warn(remark)
     system, engine_used, reason = choose_engine(system, engine)
     results.manifest["engine"] = {"name": engine_used, "reason": reason}
@@ -170,9 +170,8 @@ def run_campaign(
 def _remarks_on_discarded(study: Study, runs: Sequence[RunResult]) -> Iterator[str]:
     """Remarks on returned settings that are no solutions."""
     for algorithm in study.search.labels:
-        if count := sum(
-            run.discarded for run in runs if run.key.algorithm == algorithm
-        ):
+        count = sum(run.discarded for run in runs if run.key.algorithm == algorithm)
+        if count:
             yield (
                 f"study {study.name!r}: {count} settings that {algorithm} returned are no"
                 " solutions: the original vehicle is not safe in their encounter, or an objective"
@@ -287,7 +286,8 @@ def repeat_in_sumo(
         progress(phase, verified, len(sample))
 
     show([])
-    return {*filter(None, carry_out(verify_settings, jobs, pool, show))}
+    remarks = carry_out(verify_settings, jobs, pool, show)
+    return {remark for remark in remarks if remark}
 
 
 def journal_progress(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import file_beside
-from safevar_sumo.plugins import Files, code_files, digests, file_by_name, files_in
+from safevar_sumo.plugins import code_files, digests, file_by_name, files_in
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import RESULTS, manifest_differences, manifest_of
 from safevar_sumo.study import Study, data_files, fmus_of, user_modules
@@ -65,13 +65,13 @@ def refuse_changed_inputs(study: Study, system: System, manifest: JsonObject) ->
         )
 
 
-def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
+def files_of(study: Study, system: System, used: Iterable[str] = ()) -> dict[str, str]:
     """The digests, by name, of the files on which a study's results depend: the files of its
     networks, user code, FMUs and data files, and the files with the names `used` that exist.
     """
-    opened = list(map(open_network, filter(None, sorted(system.networks))))
+    networks = [open_network(name) for name in sorted(system.networks) if name]
     network_files = {
-        network.path(name) for network in opened for name, _ in network.digests
+        network.path(name) for network in networks for name, _ in network.digests
     }
     data = {
         file for path in data_files(study).values() for file in files_in(Path(path))
@@ -80,7 +80,7 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     return dict(sorted(files.items()))
 
 
-def code_of(study: Study, used: Iterable[str]) -> Files:
+def code_of(study: Study, used: Iterable[str]) -> dict[str, str]:
     """The digests, by name, of the user code and FMUs of a study, and of the files with the names
     `used` that exist.
     """
@@ -88,5 +88,6 @@ def code_of(study: Study, used: Iterable[str]) -> Files:
     fmus = {
         Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)
     }
-    opened = {Path(path) for name in used if (path := file_by_name(name, places))}
+    used_paths = [file_by_name(name, places) for name in used]
+    opened = {Path(path) for path in used_paths if path}
     return digests(code_files(user_modules(study), places) | fmus | opened, places)

@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from numbers import Integral
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from safevar_sumo.campaign import cluster as dask, local
 from safevar_sumo.campaign.local import Work
@@ -34,6 +34,15 @@ process of another home. () for studies without user code, which any worker carr
 LOGGER = logging.getLogger(__name__)
 SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two calls of a `Look` [s]."""
+
+
+class Spare(NamedTuple):
+    """Numbers of simulations that checks may take, if simulations are limited: the check of a
+    simulator's class, and the repetition of first batches.
+    """
+
+    check: int
+    repetition: int
 
 
 class WorkerLostError(SafevarError):
@@ -107,7 +116,7 @@ class Pool:
         self.simulated = 0
         self.failed = 0
         self.checked = 0
-        self.spare: tuple[int, int] | None = None
+        self.spare: Spare | None = None
         self.shared: dict[bytes, dict[bytes, Evaluations]] | None = None
         self.on_cluster: Work | None = None
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 import zlib
-from itertools import product, starmap
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +69,11 @@ class RunResult(NamedTuple):
 def all_runs(study: Study) -> list[RunKey]:
     """The keys of all runs of a study."""
     search = study.search
-    return list(starmap(RunKey, product(search.labels, range(search.runs))))
+    return [
+        RunKey(label, number)
+        for label in search.labels
+        for number in range(search.runs)
+    ]
 
 
 def algorithm_of(label: str, study: Study) -> Algorithm:
@@ -252,7 +255,9 @@ class Run:
 
     def receive(self, evaluations: Evaluations) -> None:
         """Write the evaluations of missing settings to the journal, and keep them."""
-        positions = list(map(self._missing.pop, map(bytes, evaluations.settings)))
+        positions = [
+            self._missing.pop(setting.tobytes()) for setting in evaluations.settings
+        ]
         if not self._journaled.isdisjoint(positions):
             raise InputError(
                 self._journal.path,

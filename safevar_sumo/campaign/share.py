@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
-from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,7 +69,7 @@ class Share(NamedTuple):
     retry_failed: bool
 
     def __str__(self) -> str:
-        names = ", ".join(map(str, self.keys[:MAX_NAMES]))
+        names = ", ".join(str(key) for key in self.keys[:MAX_NAMES])
         surplus = len(self.keys) - MAX_NAMES
         if surplus > 0:
             return f"runs {names} and {surplus} more"
@@ -102,17 +101,22 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
         runs = [
             stack.enter_context(closing(_begin(task, share, key))) for key in share.keys
         ]
-        # Each search goes on until it asks for settings that are in no journal. The settings of a
-        # run follow each other, so that `groupby` finds them.
-        while requests := [(run, setting) for run in runs for setting in run.look_up()]:
-            batches = math.ceil(len(requests) / task.batch_size)
-            for rows in np.array_split(np.arange(len(requests)), batches):
+        while True:
+            # Each search goes on until it asks for settings that are in no journal.
+            requests = [run.look_up() for run in runs]
+            settings = np.concatenate(requests)
+            if not len(settings):
+                break
+            # The number of the run that waits for each setting.
+            numbers = np.repeat(np.arange(len(runs)), [len(part) for part in requests])
+            batch_count = math.ceil(len(settings) / task.batch_size)
+            for rows in np.array_split(np.arange(len(settings)), batch_count):
                 if not has_caller():
                     raise SafevarError("nobody waits for these runs any more")
-                owners, settings = zip(*(requests[row] for row in rows), strict=True)
-                evaluations = evaluate_settings(task, np.stack(settings))
-                for run, rows_of_run in groupby(range(len(rows)), owners.__getitem__):
-                    run.receive(evaluations.take(list(rows_of_run)))
+                evaluations = evaluate_settings(task, settings[rows])
+                for number in np.unique(numbers[rows]):
+                    is_own = numbers[rows] == number
+                    runs[number].receive(evaluations.take(is_own))
                 if study.search.failed == "skip":
                     _refuse_failures(study, runs)
         refuse_changed_inputs(study, system_of(study), share.manifest)

@@ -58,7 +58,8 @@ def check_code(study: Study, pool: Pool) -> list[str]:
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"
     with suppress(OSError, msgspec.MsgspecError):
         return msgspec.json.decode(marker.read_bytes(), type=list[str])
-    job = Task(study=study), pool.spare and pool.spare[0]
+    limit = None if pool.spare is None else pool.spare.check
+    job = (Task(study=study), limit)
     opened: list[str]
     ((opened, pool.checked),) = carry_out(_refuse_defects, [job], pool)
     if pool.spare is not None:
@@ -139,12 +140,12 @@ def find_in_new_process(study: Study) -> list[Finding]:
     except UserCodeError as error:
         place = error.place or study.source
         expected = error.legal or "no exception"
-        return [Finding("contract", error.problem, place, "", expected)]
+        return [Finding("contract", error.problem, expected, where=place)]
     evaluations = drive_and_score(replace(system, points=system.points[::-1]), settings)
     for row, difference in differences(evaluations.results, repeated.results):
         words = f"{difference} in a new process"
         command = reproduction_command(study, settings[row])
-        return [Finding("repetition", words, study.source, command, SAME_ELSEWHERE)]
+        return [Finding("repetition", words, SAME_ELSEWHERE, study.source, command)]
     return []
 
 

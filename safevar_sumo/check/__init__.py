@@ -6,7 +6,7 @@ contract. No module below `sumo` or `search` imports this package.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from typing import Any
 
@@ -16,7 +16,6 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.check.oversights import find_oversights
 from safevar_sumo.check.trials import (
     Finding,
-    Findings,
     try_algorithm,
     try_simulations,
 )
@@ -85,7 +84,7 @@ CHECKS: Mapping[str, str] = {
 """The checks by name, with advice after a failure. Failures of the first four checks also prevent a
 study from starting.
 """
-OF_SIMULATORS: Mapping[str, str] = {
+ADVICE_FOR_SIMULATORS: Mapping[str, str] = {
     "order": "keep nothing of a run for the next run in a class, a module or an engine",
     "alone": (
         "keep nothing of a run for the next run in a class, a module or an engine, and let a metric"
@@ -102,8 +101,8 @@ OF_SIMULATORS: Mapping[str, str] = {
 def advice_for(finding: Finding, study: Study) -> str:
     """What to do about a finding in the user code of a study."""
     is_simulated = not study.ads.model
-    if is_simulated and finding.check in OF_SIMULATORS:
-        return OF_SIMULATORS[finding.check]
+    if is_simulated and finding.check in ADVICE_FOR_SIMULATORS:
+        return ADVICE_FOR_SIMULATORS[finding.check]
     return CHECKS[finding.check]
 
 
@@ -124,12 +123,12 @@ def study_to_check(name: str) -> Study:
     return read_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data)
 
 
-def check_study(study: Study, **how: Any) -> list[Finding]:
+def check_study(study: Study, **options: Any) -> list[Finding]:
     """Check the user code of a study. Failures of simulations are not skipped, even if the study
-    says so. For `how` see `try_simulations`.
+    says so. The `options` are those of `try_simulations`.
     """
     study = without_skipping(study)
-    findings = list(find_defects(study, **how))
+    findings = list(find_defects(study, **options))
     if findings:
         return findings
     with np.errstate(all="ignore"):
@@ -139,22 +138,16 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
         return findings
     system = assemble(study)
     problems = find_problems(system)
-    where = _definition(study, "ads.model", study.ads.model)
+    place = _definition(study, "ads.model", study.ads.model)
     if problems:
         words = sentence_on(problems, len(system.points))
-        if next(iter(problems.values())).reason is Reason.LATE:
-            where = _definition(study, "scenario.model", study.scenario.model)
-            return [
-                Finding(
-                    "meeting",
-                    words,
-                    where,
-                    "",
-                    "an encounter while the others are there",
-                )
-            ]
+        first_problem, *_ = problems.values()
+        if first_problem.reason is Reason.LATE:
+            place = _definition(study, "scenario.model", study.scenario.model)
+            expected = "an encounter while the others are there"
+            return [Finding("meeting", words, expected, where=place)]
         expected = "a drive to the encounter, without braking for nobody"
-        return [Finding("reaction", words, where, "", expected)]
+        return [Finding("reaction", words, expected, where=place)]
 
     unsafe = system.with_contact(system.criterion)
     original = drive_and_score(system, system.characteristics.original_settings)
@@ -162,9 +155,8 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
         return []
     words = f"the original vehicle itself {unsafe.breach_in_words(original)}"
     point = system.points[original.points[0]].name
-    return [
-        Finding("original", words, where, point, "an original vehicle that is safe")
-    ]
+    expected = "an original vehicle that is safe"
+    return [Finding("original", words, expected, where=place, input=point)]
 
 
 def refuse_defects(study: Study, limit: int | None = None) -> None:
@@ -187,38 +179,37 @@ def refuse_defects(study: Study, limit: int | None = None) -> None:
         )
 
 
-def find_defects(study: Study, **how: Any) -> Findings:
+def find_defects(study: Study, **options: Any) -> Iterator[Finding]:
     """Find the first defect of all simulated user code, and the first defect of each user's
-    algorithm. For `how` see `try_simulations`.
+    algorithm. The `options` are those of `try_simulations`.
     """
     names = user_code(study)
     simulated = {key: name for key, name in names if key != "search.algorithms"}
-    yield from _first_defect(study, simulated, try_simulations(study, **how))
+    yield from _first_defect(study, simulated, try_simulations(study, **options))
     for key, name in names:
-        if key == "search.algorithms" and how.get("limit") is None:
+        if key == "search.algorithms" and options.get("limit") is None:
             yield from _first_defect(study, {key: name}, try_algorithm(study, name))
 
 
 def _first_defect(
-    study: Study, names: Mapping[str, str], findings: Findings
-) -> Findings:
+    study: Study, names: Mapping[str, str], findings: Iterator[Finding]
+) -> Iterator[Finding]:
     """Yield the first of the findings with the place of the user code, or the error that the user
     code raises. `names` has the names of the user code by their keys.
     """
     places = [_definition(study, key, name) for key, name in names.items()]
-    where = " or ".join(places) or study.source
+    place = " or ".join(places) or study.source
     try:
         with about(study.source), np.errstate(all="ignore"):
             finding = next(findings, None)
         if finding is not None:
-            yield finding._replace(where=where)
+            yield finding._replace(where=place)
     except UserCodeError as error:
         yield Finding(
             "contract",
             error.problem,
-            error.place or where,
-            "",
             error.legal or "no exception",
+            where=error.place or place,
         )
 
 

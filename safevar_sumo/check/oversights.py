@@ -13,7 +13,6 @@ import numpy as np
 from safevar_sumo.check.trials import (
     TRIED_VALUES,
     Finding,
-    Findings,
     reads_a_difference,
     search_with,
     trial_settings,
@@ -53,7 +52,9 @@ vehicle ignores the step. The ratio is 2 for such a vehicle, and nearly 1 for ot
 """
 
 
-def find_oversights(study: Study) -> Iterator[tuple[Mapping[str, str], Findings]]:
+def find_oversights(
+    study: Study,
+) -> Iterator[tuple[Mapping[str, str], Iterator[Finding]]]:
     """The oversights in the user code of a study, each with the names, by their keys, of the code
     among which it is. Findings are computed one by one, when the caller asks for the next finding.
     """
@@ -67,14 +68,19 @@ def find_oversights(study: Study) -> Iterator[tuple[Mapping[str, str], Findings]
 
     stands = results["outcome"] == Outcome.NEVER_MOVED
     yield dict(code), _find_standing(settings, stands, sample)
-    own = _own_measures(study)
-    named = [label_of(name) for name in (*study.metrics.also, *study.search.objectives)]
-    for name in dict.fromkeys([*own, *named]):
+    own_measures = _own_measures(study)
+    labels = [
+        label_of(name) for name in (*study.metrics.also, *study.search.objectives)
+    ]
+    for name in dict.fromkeys([*own_measures, *labels]):
         if name in results:
             values = results[name].astype(float)
-            yield own.get(name, dict(code)), _find_undefined(name, values, sample)
-            if name in own:
-                yield own[name], _find_constant(system, name, values, sample)
+            yield (
+                own_measures.get(name, dict(code)),
+                _find_undefined(name, values, sample),
+            )
+            if name in own_measures:
+                yield own_measures[name], _find_constant(system, name, values, sample)
     if not system.mover.is_exact:
         yield dict(code), _find_misuse(list(watched_runs(system, settings)), sample)
     for key, name in code:
@@ -94,26 +100,28 @@ def _own_measures(study: Study) -> dict[str, dict[str, str]]:
     return measures
 
 
-def _find_standing(settings: FloatArray, stands: BoolArray, sample: str) -> Findings:
+def _find_standing(
+    settings: FloatArray, stands: BoolArray, sample: str
+) -> Iterator[Finding]:
     """Find that changed vehicles never move, although the original vehicle does. `stands` says
     which of N settings never move; the first one is the original.
     """
     changed = (settings != settings[0]).any(axis=1)
     if changed.any() and stands[changed].all() and not stands[0]:
         problem = "no changed vehicle moves, although the original vehicle does"
-        yield Finding("standing", problem, "", sample, "changed vehicles that drive")
+        yield Finding("standing", problem, "changed vehicles that drive", input=sample)
 
 
-def _find_undefined(name: str, values: FloatArray, sample: str) -> Findings:
+def _find_undefined(name: str, values: FloatArray, sample: str) -> Iterator[Finding]:
     """Find that a metric is undefined in all runs."""
     if np.isnan(values).all():
         problem = f"{name} is undefined in all runs"
-        yield Finding("undefined", problem, "", sample, "a value in some run")
+        yield Finding("undefined", problem, "a value in some run", input=sample)
 
 
 def _find_constant(
     system: System, name: str, values: FloatArray, sample: str
-) -> Findings:
+) -> Iterator[Finding]:
     """Find that a metric has the same value in all runs, whatever happens in them."""
     if not (values == values[0]).all():
         return
@@ -127,7 +135,7 @@ def _find_constant(
             return
     problem = f"{name} is {values[0]:g} in all runs"
     expected = "a value that depends on the run or the setting"
-    yield Finding("constant", problem, "", sample, expected)
+    yield Finding("constant", problem, expected, input=sample)
 
 
 def _variants(runs: SimulationRuns) -> Iterator[SimulationRuns]:
@@ -148,7 +156,7 @@ def _variants(runs: SimulationRuns) -> Iterator[SimulationRuns]:
                 yield ended.with_all(quantity, value)
 
 
-def _find_misuse(runs: list[WatchedRun], sample: str) -> Findings:
+def _find_misuse(runs: list[WatchedRun], sample: str) -> Iterator[Finding]:
     """Find characteristics that a simulator reads in no run, a setting that it changes, and speeds
     that belong to another sample than the gap or the position.
     """
@@ -156,24 +164,26 @@ def _find_misuse(runs: list[WatchedRun], sample: str) -> Findings:
     if unread:
         problem = f"simulate never reads {', '.join(sorted(unread))}"
         expected = "a simulator that reads each characteristic of its vehicle"
-        yield Finding("unread", problem, "", sample, expected)
+        yield Finding("unread", problem, expected, input=sample)
     for run in runs:
         for name, value in run.values.items():
-            after = run.values_after.get(name)
-            if after != value:
-                problem = (
-                    f"simulate changes {name} of its setting from {value} to {after}"
-                )
+            new_value = run.values_after.get(name)
+            if new_value != value:
+                problem = f"simulate changes {name} of its setting from {value} to {new_value}"
                 expected = "a setting that stays as it is"
-                yield Finding("modified", problem, "", "", expected)
+                yield Finding("modified", problem, expected)
         time = run.result.get(TIME, [])
-        if len(time) > 1 and (lag := lag_of_speed(run.result, time[1] - time[0])):
+        lag = ""
+        if len(time) > 1:
+            lag = lag_of_speed(run.result, time[1] - time[0])
+        if lag:
             setting = ", ".join(f"{name} = {run.values[name]:g}" for name in run.values)
+            problem = f"simulate returns a {lag}"
             expected = "in each sample, the quantities of one moment"
-            yield Finding("shift", f"simulate returns a {lag}", "", setting, expected)
+            yield Finding("shift", problem, expected, input=setting)
 
 
-def _find_ignored_step(system: System) -> Findings:
+def _find_ignored_step(system: System) -> Iterator[Finding]:
     """Find a vehicle model that changes by the same in each step, whatever the length of the
     step.
     """
@@ -191,7 +201,7 @@ def _find_ignored_step(system: System) -> Findings:
                 f" {STEP / 2:g} s, and by up to {change:.3g} m/s^2 in steps of {STEP:g} s"
             )
             expected = "nearly the same with any step"
-            yield Finding("step", problem, "", "the original vehicle", expected)
+            yield Finding("step", problem, expected, input="the original vehicle")
 
 
 def _largest_changes(system: System, step: float) -> dict[str, float]:
@@ -220,10 +230,12 @@ def _largest_changes(system: System, step: float) -> dict[str, float]:
     return largest
 
 
-def _find_duplicates(study: Study, name: str) -> Findings:
+def _find_duplicates(study: Study, name: str) -> Iterator[Finding]:
     """Find solutions that an algorithm returns again."""
     solutions = search_with(study, name, seeds=(1,)).returned
-    again = len(solutions) - len(np.unique(solutions, axis=0))
-    if again:
-        problem = f"search returns {again} of {len(solutions)} solutions again"
-        yield Finding("duplicates", problem, "", "", "each solution once")
+    duplicate_count = len(solutions) - len(np.unique(solutions, axis=0))
+    if duplicate_count:
+        problem = (
+            f"search returns {duplicate_count} of {len(solutions)} solutions again"
+        )
+        yield Finding("duplicates", problem, "each solution once")

@@ -56,7 +56,6 @@ MAX_TRIED_EVALUATIONS = 57
 """Largest number of evaluations of an algorithm's run."""
 MAX_POPULATION = 20
 """Largest population of an algorithm's run."""
-_Rows = IntArray
 
 
 class Finding(NamedTuple):
@@ -68,20 +67,20 @@ class Finding(NamedTuple):
         The name of the check.
     finding
         The wrong result.
+    expected
+        The right result.
     where
         The file and line of the user code; "" in a finding of a trial, which does not know the
         place.
     input
         The vehicle with the wrong result, in words.
-    expected
-        The right result.
     """
 
     check: str
     finding: str
-    where: str
-    input: str
     expected: str
+    where: str = ""
+    input: str = ""
 
     def __str__(self) -> str:
         """The finding with its input and place on one line."""
@@ -91,10 +90,6 @@ class Finding(NamedTuple):
         if self.where not in self.finding:
             line += f" ({self.where})"
         return line
-
-
-Findings = Iterator[Finding]
-"""Findings that are computed one by one, when the caller asks for the next finding."""
 
 
 class Extent(NamedTuple):
@@ -123,7 +118,7 @@ def try_simulations(
     progress: Progress = show_no_progress,
     tell: Callable[[Extent], None] = lambda extent: None,
     limit: int | None = None,
-) -> Findings:
+) -> Iterator[Finding]:
     """Simulate a study with the original vehicle, the corners of the domains and random settings,
     and compare repeated simulations.
 
@@ -172,7 +167,7 @@ def try_simulations(
         drive_and_score(system, settings[:LEAST_SIMULATED])
         return
 
-    def load() -> Callable[[_Rows], ResultColumns]:
+    def load() -> Callable[[IntArray], ResultColumns]:
         system = trial_system(study)
         return lambda rows: drive_and_score(system, settings[rows]).results
 
@@ -190,13 +185,13 @@ def try_simulations(
             verify_in_sumo(system, settings, drive_and_score(system, settings).points)
         except InputError as error:
             problem, _, setting = error.problem.partition(", with ")
-            reacts = (
+            expected = (
                 "reactive_actors = True where somebody reacts to the vehicle under test"
             )
-            yield Finding("contract", problem, "", setting, reacts)
+            yield Finding("contract", problem, expected, input=setting)
 
 
-def find_unstated_needs(system: System, runs: SimulationRuns) -> Findings:
+def find_unstated_needs(system: System, runs: SimulationRuns) -> Iterator[Finding]:
     """Find metrics that read a quantity that their `needs` do not state."""
     for measure in system.measuring.measures.values():
         if measure.of == "settings":
@@ -208,7 +203,7 @@ def find_unstated_needs(system: System, runs: SimulationRuns) -> Findings:
             if reads_a_difference(measure, system, runs, variants):
                 got = f"the metric {measure.name} reads {quantity}, which its needs do not state"
                 expected = f"needs = {(*measure.quantities, quantity)}"
-                yield Finding("contract", got, "", "the original vehicle", expected)
+                yield Finding("contract", got, expected, input="the original vehicle")
 
 
 def reads_a_difference(
@@ -248,7 +243,7 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     return number, number * seconds
 
 
-def try_algorithm(study: Study, name: str) -> Findings:
+def try_algorithm(study: Study, name: str) -> Iterator[Finding]:
     """Let an algorithm search twice with the same seed, the second time after a run with another
     seed. Both searches must request and return the same settings.
     """
@@ -259,20 +254,41 @@ def try_algorithm(study: Study, name: str) -> Findings:
         difference = (
             f"{len(repeated)} settings instead of {len(outputs)} in another run"
         )
-        yield Finding("repetition", difference, "", "", expected)
+        yield Finding("repetition", difference, expected)
     elif (outputs != repeated).any():
         row = int(np.argmax((outputs != repeated).any(axis=1)))
         difference = f"setting {row} is {repeated[row].tolist()} instead of {outputs[row].tolist()}"
-        yield Finding("repetition", f"{difference} in another run", "", "", expected)
+        yield Finding("repetition", f"{difference} in another run", expected)
+
+
+class _Repetition(NamedTuple):
+    """Another run of settings.
+
+    Attributes
+    ----------
+    simulate
+        The function that simulates rows of settings.
+    check
+        The name of the check that fails if results differ.
+    circumstance
+        What is different in this run, in words.
+    rows
+        The rows of the settings that are simulated.
+    """
+
+    simulate: Callable[[IntArray], ResultColumns]
+    check: str
+    circumstance: str
+    rows: IntArray
 
 
 def _try(
-    load: Callable[[], Callable[[_Rows], ResultColumns]],
+    load: Callable[[], Callable[[IntArray], ResultColumns]],
     characteristics: CharacteristicSet,
     settings: FloatArray,
     progress: Progress,
     expected: str,
-) -> Findings:
+) -> Iterator[Finding]:
     """Compare a run of all settings with other runs of the same settings. `load` loads all user
     code again, and returns a function that simulates rows of settings.
     """
@@ -283,24 +299,27 @@ def _try(
     progress("vehicles", number, total)
     outputs = run(all_rows)
     run_anew = load()
-    other_runs = [
-        (run, "repetition", "in a second run", all_rows),
-        (run_anew, "order", "in another order", all_rows[::-1]),
-        *(
-            (run_anew, "alone", "in a smaller batch", rows)
-            for rows in np.array_split(all_rows, min(SMALLER_BATCHES, len(all_rows)))
-        ),
-        (run_anew, "alone", "alone", all_rows[:1]),
-        (run_anew, "alone", "alone", all_rows[-1:]),
+    repetitions = [
+        _Repetition(run, "repetition", "in a second run", all_rows),
+        _Repetition(run_anew, "order", "in another order", all_rows[::-1]),
     ]
-    for other_run, check, circumstance, rows in other_runs:
+    for rows in np.array_split(all_rows, min(SMALLER_BATCHES, len(all_rows))):
+        repetitions.append(_Repetition(run_anew, "alone", "in a smaller batch", rows))
+    for rows in (all_rows[:1], all_rows[-1:]):
+        repetitions.append(_Repetition(run_anew, "alone", "alone", rows))
+    for repetition in repetitions:
+        rows = repetition.rows
         number += len(rows)
         progress("vehicles", number, total)
         expected_outputs = {name: values[rows] for name, values in outputs.items()}
-        for row, difference in differences(expected_outputs, other_run(rows)):
+        for row, difference in differences(expected_outputs, repetition.simulate(rows)):
             changes = characteristics.changes_in_words(settings[rows[row]])
-            vehicle = changes or "the original vehicle"
-            yield Finding(check, f"{difference} {circumstance}", "", vehicle, expected)
+            yield Finding(
+                repetition.check,
+                f"{difference} {repetition.circumstance}",
+                expected,
+                input=changes or "the original vehicle",
+            )
 
 
 def trial_settings(characteristics: CharacteristicSet, count: int) -> FloatArray:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import click
 from click.shell_completion import CompletionItem
@@ -77,7 +77,9 @@ ENDED_OPTIONS = {
     "tolerance --together": "no such option: joint limits are always part of the answer",
 }
 """Options of earlier releases, with the text that says what replaces each option."""
-CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
+CONDITION = re.compile(
+    rf"\s*(?P<key>[^\s<>=]+)\s*(?P<comparison><=|>=|<|>)\s*(?P<limit>{NUMBER_PATTERN})\s*"
+)
 
 
 class _Command(click.Command):
@@ -113,9 +115,11 @@ class _Command(click.Command):
                     flags.append(options.pop(name).opts[0])
             if flags:
                 lines.append((title, ", ".join(flags)))
-        records = (option.get_help_record(ctx) for option in options.values())
+        records = [option.get_help_record(ctx) for option in options.values()]
+        # An option that is hidden has no record.
+        shown_records = [record for record in records if record is not None]
         with formatter.section("Options"):
-            formatter.write_dl(list(filter(None, records)), col_max=16)
+            formatter.write_dl(shown_records, col_max=16)
 
         if lines:
             with formatter.section(
@@ -189,9 +193,10 @@ def _give_answer(
         The name is that of a number in --json.
     """
     # A condition or table that the answer cannot have is refused before hours of simulation.
-    conditions = list(map(_parse, fail_if))
+    conditions = [_parse(text) for text in fail_if]
     if declared:
-        _check_names(declared, values, [key for key, _, _ in conditions], table)
+        keys = [condition.key for condition in conditions]
+        _check_names(declared, values, keys, table)
     if plot is not None:
         check_writable(plot, "plot", PICTURE_ENDINGS)
 
@@ -246,14 +251,15 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     def print_text(**values: Any) -> None:
         click.echo(call(**values))
 
+    arguments = [_argument(parameter) for parameter in positional]
     flags = [_flag(option) for name, option in options.items() if name != "table"]
     callback = print_text
     if "Answer" in str(signature.return_annotation):
-        flags += map(_flag, options_of(_give_answer).values())
+        flags += [_flag(option) for option in options_of(_give_answer).values()]
         callback = partial(_give_answer, call, contents_of(function))
     return _Command(
         name,
-        params=[*map(_argument, positional), *flags, *LOG_OPTIONS, HELP_ALL],
+        params=[*arguments, *flags, *LOG_OPTIONS, HELP_ALL],
         callback=callback,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
     )
@@ -277,15 +283,23 @@ def _check_names(
         check_name("table", f"there is no table {table!r}", table, declared.tables)
 
 
-def _exit_on_failures(
-    answer: Answer, conditions: Sequence[tuple[str, str, float]]
-) -> None:
+class _Condition(NamedTuple):
+    """A condition of --fail-if: the key of a number of the answer, a comparison (a key of
+    `COMPARISONS`), and a limit.
+    """
+
+    key: str
+    comparison: str
+    limit: float
+
+
+def _exit_on_failures(answer: Answer, conditions: Sequence[_Condition]) -> None:
     """End with the exit code of the answer. Print the reasons for the code, unless the verdict
     states them already.
     """
     failures = list(answer.failures)
     for condition in conditions:
-        failures += _fulfilments(answer, *condition)
+        failures += _fulfilments(answer, condition)
     for sentence in failures:
         if sentence not in answer.verdict:
             click.echo(f"failed: {sentence}", err=True)
@@ -329,12 +343,12 @@ def prints_to_standard_error() -> Iterator[None]:
 def _argument(parameter: inspect.Parameter) -> click.Argument:
     """Make the positional argument of a command from a parameter of its function."""
     is_repeated = parameter.kind is parameter.VAR_POSITIONAL
+    metavar = METAVARS.get(parameter.name, parameter.name.upper())
     return click.Argument(
         [parameter.name],
         nargs=-1 if is_repeated else 1,
         required=parameter.default is parameter.empty,
-        metavar=METAVARS.get(parameter.name, parameter.name.upper())
-        + "..." * is_repeated,
+        metavar=f"{metavar}..." if is_repeated else metavar,
         shell_complete=_complete_study,
     )
 
@@ -401,22 +415,24 @@ def _print(answer: Answer, form: str, table: str | None, *, details: bool) -> No
         click.echo(answer.render(form), nl=False)
 
 
-def _parse(text: str) -> tuple[str, str, float]:
-    """Parse a condition: its key, operator and limit."""
+def _parse(text: str) -> _Condition:
+    """Parse a condition of --fail-if."""
     match = CONDITION.fullmatch(text)
-    if match is None or not math.isfinite(limit := float(match[3])):
+    limit = float(match["limit"]) if match else math.nan
+    if match is None or not math.isfinite(limit):
         raise InputError(
             "fail_if",
             repr(text),
             '"KEY > X" with <, <=, > or >= and a number, such as "probability > 0.01"',
         )
-    return match[1], match[2], limit
+    return _Condition(match["key"], match["comparison"], limit)
 
 
-def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[str]:
+def _fulfilments(answer: Answer, condition: _Condition) -> Iterator[str]:
     """Yield a sentence for each number of the answer that fulfils a condition. If the answer has no
     such number, print a note.
     """
+    key = condition.key
     values = answer.values(key)
     if None in values or not values:
         state = "undefined" if values else "in no row"
@@ -431,5 +447,7 @@ def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[
             raise InputError(
                 "fail_if", f"{key} is no number", "the key of a number of the answer"
             )
-        if value is not None and COMPARISONS[sign](value, limit):
-            yield f"{key} = {value:g} {sign} {limit:g}{row}"
+        if value is None:
+            continue
+        if COMPARISONS[condition.comparison](value, condition.limit):
+            yield f"{key} = {value:g} {condition.comparison} {condition.limit:g}{row}"

@@ -25,8 +25,8 @@ from safevar_sumo.errors import (
     InputError,
     SafevarError,
     did_you_mean,
-    in_main_thread,
     printable,
+    settable_interrupts,
 )
 from safevar_sumo.shipped import PROGRAM, PROGRAM_COMMAND
 
@@ -104,7 +104,7 @@ class LazyCommands(click.Group):
         """Refuse an unknown command. The error names the nearest command, or what replaces the
         command.
         """
-        name = args[0] if args else "-"
+        name = args[0]
         if name in ENDED_COMMANDS:
             raise InputError(
                 name, "a command of releases before 0.5", ENDED_COMMANDS[name]
@@ -121,17 +121,18 @@ class LazyCommands(click.Group):
             return super().invoke(ctx)
         except InputError as error:
             command = self.get_command(ctx, str(ctx.invoked_subcommand))
+            parameters = command.params if command else []
             long_flags = {
                 option.name: option.opts[-1]
-                for option in (command.params if command else ())
+                for option in parameters
                 if isinstance(option, click.Option)
             }
             # The source of an error may also be a path: only a text may name an argument.
             if isinstance(error.source, str):
                 error.source = long_flags.get(error.source, error.source)
-            to_flag = partial(_to_flag, long_flags)
-            error.problem = ARGUMENT.sub(to_flag, error.problem)
-            error.legal = ARGUMENT.sub(to_flag, error.legal)
+            convert = partial(_flag_of, long_flags)
+            error.problem = ARGUMENT.sub(convert, error.problem)
+            error.legal = ARGUMENT.sub(convert, error.legal)
             raise
 
     def format_commands(
@@ -154,11 +155,11 @@ def command_function(command: str) -> Callable[..., Any]:
     return function
 
 
-def first_paragraph(function: str) -> str:
+def first_paragraph(function_name: str) -> str:
     """The first paragraph of a function's docstring. The text is read from the file, because an
     import takes long.
     """
-    module, _, name = function.partition(":")
+    module, _, name = function_name.partition(":")
     path = Path(__file__).parents[1] / module.replace(".", "/")
     file = path.with_suffix(".py")
     if not file.exists():
@@ -172,7 +173,7 @@ def first_paragraph(function: str) -> str:
     return " ".join(docstring[1].split())
 
 
-def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
+def _flag_of(flags: dict[str, str], argument: re.Match[str]) -> str:
     """The flag that sets an argument, followed by its value unless the flag takes none. A word that
     is no argument stays.
     """
@@ -280,7 +281,7 @@ def _heeded_interrupts() -> Iterator[signal.Signals]:
     """The interrupts that this thread may handle, except those that the caller of the program lets
     it ignore, as `nohup` does.
     """
-    for interrupt in INTERRUPTS if in_main_thread() else ():
+    for interrupt in settable_interrupts():
         if signal.getsignal(interrupt) is not signal.SIG_IGN:
             yield interrupt
 

@@ -35,4 +35,4 @@ class MetricBound(NamedTuple):
     @property
     def sign(self) -> int:
         """1 if small values are unsafe, -1 if large values are unsafe."""
-        return 1 - 2 * self.worst_is_largest
+        return -1 if self.worst_is_largest else 1

@@ -44,15 +44,15 @@ def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     first_sample = np.argmax(trace.brake > pedal[0] + PEDAL_ROUNDING, axis=0)
     first_command = trace.brake[first_sample, vehicles]
     _, part, full = pedal[samples, vehicles]
-    loss, later_loss = -np.diff(trace.speed[samples, vehicles], axis=0)
+    loss, next_loss = -np.diff(trace.speed[samples, vehicles], axis=0)
     is_whole_command = np.abs(full - first_command) <= PEDAL_ROUNDING
-    is_part = (part < full) & is_whole_command & (later_loss > 0)
-    shares = np.maximum(part / full, loss / later_loss)
-    share = np.where(is_part, np.minimum(shares, 1.0), 1.0)
+    is_part = (part < full) & is_whole_command & (next_loss > 0)
+    ratio = np.maximum(part / full, loss / next_loss)
+    share = np.where(is_part, np.minimum(ratio, 1.0), 1.0)
 
     step_begin, step_end, _ = trace.position[samples, vehicles]
     distance = trace.position[-1] - step_end + share * (step_end - step_begin)
-    return _of_stops(runs, np.where(is_pressed.any(axis=0), distance, np.nan))
+    return _mask_unstopped(runs, np.where(is_pressed.any(axis=0), distance, np.nan))
 
 
 STOPPING_DISTANCE = Measure(
@@ -68,7 +68,7 @@ STOPPING_DISTANCE = Measure(
 )
 
 
-def _of_stops(runs: SimulationRuns, values: FloatArray) -> FloatArray:
+def _mask_unstopped(runs: SimulationRuns, values: FloatArray) -> FloatArray:
     """The values of vehicles, shape (N,), with NaN for a vehicle that has not stopped or has
     collided.
     """
@@ -84,7 +84,7 @@ def stop_from_pedal(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArra
     is_commanded = trace.brake > 0
     begin = np.argmax(is_commanded, axis=0)
     distance = trace.position[-1] - trace.position[begin, np.arange(len(begin))]
-    return _of_stops(runs, np.where(is_commanded.any(axis=0), distance, np.nan))
+    return _mask_unstopped(runs, np.where(is_commanded.any(axis=0), distance, np.nan))
 
 
 STOP_FROM_PEDAL = Measure(
@@ -126,7 +126,7 @@ def mean_fully_developed_deceleration(
     begin_places, end_places = np.transpose(places)
     first_squares, last_squares = end_squares
     ways = end_places - begin_places
-    return _of_stops(runs, (first_squares - last_squares) / (2 * ways))
+    return _mask_unstopped(runs, (first_squares - last_squares) / (2 * ways))
 
 
 MFDD = Measure(

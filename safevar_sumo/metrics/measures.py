@@ -225,7 +225,8 @@ def post_encroachment_time(
     """
     trace = runs.trace
     number = np.count_nonzero(trace.active, axis=0)
-    at_end = np.minimum(number, len(trace.time) - 1), np.arange(len(number))
+    last_samples = np.minimum(number, len(trace.time) - 1)
+    vehicles = np.arange(len(number))
     columns = np.broadcast_arrays(
         trace.speed,
         trace.gap,
@@ -234,7 +235,7 @@ def post_encroachment_time(
         trace.obstacle_width,
     )
     speed, gap, lateral, lateral_speed, obstacle_width = (
-        column[at_end] for column in columns
+        column[last_samples, vehicles] for column in columns
     )
 
     # Either the body has left the vehicle's path (`body_is_first`), or the vehicle has passed the

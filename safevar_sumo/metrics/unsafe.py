@@ -244,8 +244,11 @@ class Unsafe:
         3.21 m/s`, `keeps 0.04 m of clearance, less than 0.3 m`. With repeats the text also says how
         many runs are unsafe.
         """
+        breach = self._breach_in_words(vehicle)
         runs = runs_in_words(self.failing_runs(vehicle)[:, 0])
-        return " and ".join(filter(None, (self._breach_in_words(vehicle), runs)))
+        if runs:
+            return f"{breach} and {runs}"
+        return breach
 
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         """What an unsafe vehicle does, in words, without the number of runs."""

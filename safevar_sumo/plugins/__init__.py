@@ -17,7 +17,6 @@ from safevar_sumo.plugins.contract import (
     user_errors as user_errors,
 )
 from safevar_sumo.plugins.files import (
-    Files as Files,
     code_files as code_files,
     digests as digests,
     file_by_name as file_by_name,

@@ -278,8 +278,9 @@ class UserCode(NamedTuple):
         """
 
         def checked(*arguments: Any) -> FloatArray:
+            views = [read_only(argument) for argument in arguments]
             with np.errstate():
-                values = function(*map(read_only, arguments))
+                values = function(*views)
             return self.check_numbers(
                 method, "values", values, (len(arguments[0]),), legal
             ).astype(float)
@@ -368,11 +369,11 @@ def checked_class(code: UserCode, base: type) -> type:
         # Errors name the line of the user's method, which `inspect.unwrap` finds.
         @functools.wraps(getattr(candidate, name))
         def method(self: Any, *arguments: Any) -> UserValue:
-            passed = list(arguments)
+            call_arguments = list(arguments)
             if returned.like is not None:
-                passed[returned.like] = read_only(arguments[returned.like])
+                call_arguments[returned.like] = read_only(arguments[returned.like])
             with np.errstate():
-                result = getattr(super(cls, self), name)(*passed)
+                result = getattr(super(cls, self), name)(*call_arguments)
             is_optional = returned.then is None and not hasattr(
                 getattr(base, name), ABSTRACT
             )
@@ -418,8 +419,10 @@ def violation(candidate: Any, base: type) -> str:
         ) and inspect.isfunction(
             inspect.getattr_static(candidate, name, getattr(base, name))
         )
+        # The names stand for values: only the signature is compared.
+        arguments = ["self", *parameters] if takes_self else parameters
         try:
-            inspect.signature(attribute).bind(*[None] * (takes_self + len(parameters)))
+            inspect.signature(attribute).bind(*arguments)
         except TypeError:
             return f"has a method {name} that does not take ({', '.join(parameters)})"
     return ""

@@ -18,8 +18,6 @@ from safevar_sumo.shipped import NETWORKS, PACKAGE
 
 DIGEST_LENGTH = 16
 """Length of the digest of a file [characters]."""
-Files = dict[str, str]
-"""Digests of files, by the names that `digests` gives to the files."""
 CACHE = "__pycache__"
 """The name of Python's folders for compiled files."""
 HIDDEN_PATH = re.compile(rf"(^|/)(\.|{CACHE}(/|\Z))")
@@ -118,7 +116,7 @@ def files_in(path: Path) -> list[Path]:
     ]
 
 
-def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
+def digests(paths: Iterable[Path], folders: Sequence[str]) -> dict[str, str]:
     """The digests of files, by their names.
 
     Parameters

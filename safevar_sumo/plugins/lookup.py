@@ -110,7 +110,8 @@ class Lookup:
                 f"{key} = {name!r} names a file",
                 f"its module: '{dotted}:{attribute}'",
             )
-        if not all(map(str.isidentifier, [attribute, *module_name.split(".")])):
+        parts = [attribute, *module_name.split(".")]
+        if not all(part.isidentifier() for part in parts):
             problem = f"{key} = {name!r}{did_you_mean(name, shipped)}"
             raise InputError("", problem, expected)
 
@@ -150,11 +151,15 @@ class Lookup:
         if member.code is None:
             return member
         base = _base_of(member.target, bases)
-        if reason := violation(member.target, base):
+        reason = violation(member.target, base)
+        if reason:
+            legal_texts = [contract_of(base) for base in bases]
+            if otherwise:
+                legal_texts.append(otherwise)
             raise UserCodeError(
                 "",
                 f"{member.code.name} {reason}",
-                "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])]),
+                "; or ".join(legal_texts),
                 member.code.definition(),
             )
         member = self._classes[name, bases] = member._replace(

@@ -187,11 +187,11 @@ class Modules:
 
 def _show(modules: Modules | None) -> None:
     """Let `sys.modules` hold these modules, and no others of user code that a study names."""
-    shown = this_process.shown_modules
-    if shown is modules:
+    shown_modules = this_process.shown_modules
+    if shown_modules is modules:
         return
-    if shown is not None:
-        shown.hide()
+    if shown_modules is not None:
+        shown_modules.hide()
     this_process.shown_modules = modules
     if modules is not None:
         modules.show()

@@ -19,7 +19,7 @@ from uuid import uuid4
 
 import platformdirs
 
-from safevar_sumo.errors import INTERRUPTS, in_main_thread
+from safevar_sumo.errors import settable_interrupts
 from safevar_sumo.plugins.files import CACHE, is_user_file, name_of_file
 from safevar_sumo.shipped import PACKAGE
 
@@ -102,7 +102,8 @@ CLOSED = "user code has closed descriptors of its process"
 
 def note_work(text: str) -> None:
     """Note the work of this process, if it is a worker, in case that it dies of this work."""
-    if (words := this_process.last_words) is not None:
+    words = this_process.last_words
+    if words is not None:
         words.seek(0)
         words.truncate()
         words.write(f"{text}\n")
@@ -152,7 +153,8 @@ def find_damage() -> Iterator[list[str]]:
 
 def _end_without_pipes() -> None:
     """End this process, if it is a worker, after its last words."""
-    if (words := this_process.last_words) is not None:
+    words = this_process.last_words
+    if words is not None:
         with suppress(OSError), Path(words.name).open("r+", encoding="utf-8") as file:
             file.seek(0, os.SEEK_END)
             file.write(f"{CLOSED}\n")
@@ -190,10 +192,11 @@ def mark_interrupts() -> Iterator[None]:
         except KeyboardInterrupt:
             raise Interrupt from None
 
-    # Python interrupts only the main thread, and only the main thread may set handlers.
+    # Python interrupts only the main thread.
     handlers: dict[int, Any] = {}
-    for number in INTERRUPTS if in_main_thread() else ():
-        if callable(handler := signal.getsignal(number)):
+    for number in settable_interrupts():
+        handler = signal.getsignal(number)
+        if callable(handler):
             handlers[number] = handler
             signal.signal(number, interrupt)
     try:
@@ -211,20 +214,23 @@ def defer_interrupts() -> Iterator[None]:
     compiler would print the exception, and go on.
     """
     waiting: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        waiting.append(number)
+
     handlers = {}
-    for interrupt in INTERRUPTS if in_main_thread() else ():
+    for interrupt in settable_interrupts():
         # A handler that Python has not set (None) could not be set again.
         if signal.getsignal(interrupt) is not None:
-            handlers[interrupt] = signal.signal(
-                interrupt, lambda number, _: waiting.append(number)
-            )
+            handlers[interrupt] = signal.signal(interrupt, note)
     try:
         yield
     finally:
-        for code, handler in handlers.items():
-            signal.signal(code, handler)
-        for number in waiting[:1]:
-            signal.raise_signal(number)
+        for interrupt, handler in handlers.items():
+            signal.signal(interrupt, handler)
+        # The first signal ends the command: further ones would say nothing more.
+        if waiting:
+            signal.raise_signal(waiting[0])
 
 
 @contextmanager
@@ -241,7 +247,8 @@ def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
 
     start = time.time()
     names = list[str]()
-    opened = this_process.opened = set[str]()
+    opened = set[str]()
+    this_process.opened = opened
     try:
         yield names
     finally:
@@ -252,9 +259,13 @@ def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
     )
     # In these folders, libraries keep files of their own, such as lists of fonts.
     caches = (platformdirs.user_cache_path(), platformdirs.user_config_path())
-    not_the_users = (*SYSTEM_FOLDERS, *(f"{path}{os.sep}" for path in caches))
-    for path in filter(is_user_file, opened):
-        is_of_user = path.startswith(own_folders) or not path.startswith(not_the_users)
+    foreign_folders = (*SYSTEM_FOLDERS, *(f"{path}{os.sep}" for path in caches))
+    for path in opened:
+        if not is_user_file(path):
+            continue
+        is_of_user = path.startswith(own_folders) or not path.startswith(
+            foreign_folders
+        )
         is_cache = path.endswith(".pyc") or f"{os.sep}{CACHE}{os.sep}" in path
         # A file that is newer than the beginning of the block was written by the user code itself.
         is_older = os.path.isfile(path) and os.path.getmtime(path) < start

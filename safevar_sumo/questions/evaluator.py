@@ -34,7 +34,6 @@ from safevar_sumo.campaign.inputs import code_of
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, Unsafe
-from safevar_sumo.plugins import Files
 from safevar_sumo.questions.between import in_phases
 from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.price import (
@@ -126,7 +125,7 @@ class Evaluator:
         return assemble(self.study)
 
     @cached_property
-    def code(self) -> Files:
+    def code(self) -> dict[str, str]:
         """The digests, by name, of the study's user code and of the files that this code opens."""
         return code_of(self.study, opened_by(self.study, self._pool))
 

@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError, printable
 from safevar_sumo.questions.bars import LEGEND, Bar
 from safevar_sumo.questions.changes import NUMBER_PATTERN
 from safevar_sumo.shipped import shipped_table
-from safevar_sumo.terminal import WholeTable
+from safevar_sumo.terminal import ColumnOfTexts, WholeTable
 
 LOW = "_low"
 HIGH = "_high"
@@ -424,8 +424,10 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
         blocks.insert(0, [columns[0], ranges])
     title = table.title
     for block in blocks:
-        heads_and_texts = [(item.head, item.is_number, item.texts) for item in block]
-        yield WholeTable(title, heads_and_texts)
+        columns_of_texts = [
+            ColumnOfTexts(item.head, item.is_number, item.texts) for item in block
+        ]
+        yield WholeTable(title, columns_of_texts)
         title = ""
     for column in long_columns:
         for label, text in zip(columns[0].texts, column.texts, strict=True):

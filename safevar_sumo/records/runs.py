@@ -355,12 +355,12 @@ class SimulationRuns:
         )
         min_speed = np.minimum(speed_before, speed_after)
         max_speed = np.maximum(speed_before, speed_after)
-        at_contact = np.minimum(
+        contact_speed = np.minimum(
             np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed
         )
 
         # Otherwise the speed at the end of the step counts.
-        at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
+        end_speed = self.collision_speed - obstacle_speed[last_sample, vehicles]
         return np.where(
-            gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step
+            gap_closes & ~np.isnan(self.collision_speed), contact_speed, end_speed
         )

@@ -158,9 +158,9 @@ def _columns_by_name(
     """
     names = [str(name) for name in table]
     plain_names = [_plain_name(name) for name in names]
-    by_plain_name = dict(zip(plain_names, names, strict=True))
+    names_by_plain_name = dict(zip(plain_names, names, strict=True))
     columns = {
-        name: by_plain_name.get(_plain_name(name), name)
+        name: names_by_plain_name.get(_plain_name(name), name)
         for name in characteristics.names
     }
     columns |= COLUMNS

@@ -311,7 +311,7 @@ def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float,
     """
     x, y = np.stack([(body.x, body.y) for body in bodies], axis=1)
     sizes = np.array([(body.length, body.width / 2) for body in bodies])
-    length, half_width = sizes.T[:, :, None]
+    length, half_width = sizes.T[:, :, np.newaxis]
     rear = np.nanmin(x - length) - FREE_SPACE
     front = np.nanmax(x + length) + FREE_SPACE
     bottom = np.nanmin(y - half_width) - FREE_SPACE
@@ -370,7 +370,7 @@ def _draw_body(body: DrawnBody, *, is_outline: bool) -> Patch:
             "fill": False,
             "linewidth": 2,
             "linestyle": "--",
-            "zorder": 2 + 2 * body.is_vut,
+            "zorder": 4 if body.is_vut else 2,
         }
     if body.is_person:
         return Circle((0, 0), max(body.length, body.width) / 2, **style)

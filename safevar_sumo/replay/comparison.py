@@ -188,12 +188,12 @@ class Comparison:
             distance = runs.trace.gap if has_gap else runs.encounter.separation
             ending = f"{ending} with {distance[nearest, row]:.2f} m to spare"
 
-        texts = (
-            f"{metric.title} {value:.1f}{unit_text(metric.unit)}"
-            for metric in self.objectives
-            if np.isfinite(value := self.evaluations.metrics[metric.name][row])
-        )
-        return ", ".join([ending, *texts])
+        texts = [ending]
+        for metric in self.objectives:
+            value = self.evaluations.metrics[metric.name][row]
+            if np.isfinite(value):
+                texts.append(f"{metric.title} {value:.1f}{unit_text(metric.unit)}")
+        return ", ".join(texts)
 
 
 # A simulator of the user's own states no sizes: these sizes are drawn [m].

@@ -137,12 +137,12 @@ def poses_of(comparison: Comparison) -> list[Poses]:
             continue
         heading = track.heading[:end, row]
         kind = "bicycle" if track.width < BICYCLE_WIDTH else "car"
-        to_middle = track.length / 2
+        middle_distance = track.length / 2
         if track.is_person:
             kind = "pedestrian"
-            to_middle = 0.0
-        x = x - to_middle * np.cos(heading)
-        y = y - to_middle * np.sin(heading)
+            middle_distance = 0.0
+        x = x - middle_distance * np.cos(heading)
+        y = y - middle_distance * np.sin(heading)
 
         samples = np.stack([time, x, y, heading])[:, is_present]
         actor = Poses(name, kind, track.length, track.width, *samples)

@@ -118,11 +118,14 @@ def _mark_moments(
     ) -> None:
         point = (trace.time[sample], value)
         colour = COLOURS[row]
+        size = 12 - 4 * row
+        if mark == IMPACT_MARK:
+            size += 2
         axis.plot(
             *point,
             mark,
             color=colour,
-            markersize=12 - 4 * row + 2 * (mark == IMPACT_MARK),
+            markersize=size,
             linestyle="",
             zorder=6 + row,
             markeredgecolor="white",
@@ -150,19 +153,16 @@ def _mark_moments(
             xytext=(3, 7),
             ha="left",
         )
-    if nearest is not None and np.isfinite(gap := trace.gap[nearest, row]):
-        is_largest = (
-            np.argmax(np.where(trace.active, trace.gap, np.inf).min(axis=0)) == row
-        )
-        mark, text = (
-            (IMPACT_MARK, "impact") if has_impact else (NEAREST_MARK, f"{gap:.2f} m")
-        )
+    if nearest is not None and np.isfinite(trace.gap[nearest, row]):
+        gap = trace.gap[nearest, row]
+        least_gaps = np.where(trace.active, trace.gap, np.inf).min(axis=0)
+        is_largest = np.argmax(least_gaps) == row
         draw(
             gap_axis,
             nearest,
             gap,
-            mark,
-            text,
+            IMPACT_MARK if has_impact else NEAREST_MARK,
+            "impact" if has_impact else f"{gap:.2f} m",
             xytext=(0, 9 if is_largest else -17),
             ha="center",
         )

@@ -33,7 +33,8 @@ from safevar_sumo.sumo.without_effect import without_effect
 from safevar_sumo.vehicles import CharacteristicSet
 
 REMARKS: Columns = {"remark": "what to know about this simulation"}
-CHARACTERISTICS, RESULTS, POINTS = shipped_columns("simulate").values()
+COLUMNS_BY_TABLE = shipped_columns("simulate")
+"""The columns of the answer's tables, by the names of the tables."""
 OUTCOME_NAMES = (
     "outcome",
     "collision",
@@ -45,7 +46,7 @@ OUTCOME_NAMES = (
     "f_num_diff",
 )
 """Names of numbers that an answer has in every study, besides the metrics."""
-OF_SEARCH = ("gap", "f_safe", "f_diff", "f_num_diff")
+SEARCH_RESULTS = ("gap", "f_safe", "f_diff", "f_num_diff")
 """Results that the first view leaves out: only a search needs them, or other results say the same.
 """
 
@@ -86,16 +87,24 @@ def answer_of_setting(
     numbers = simulation.numbers
     units = {"outcome": "", **simulation.units}
     results = [
-        (name, unit, original[name], numbers[name]) for name, unit in units.items()
+        {
+            "result": name,
+            "unit": unit,
+            "original": original[name],
+            "simulated": numbers[name],
+        }
+        for name, unit in units.items()
     ]
     tables = {
         "characteristics": _characteristics(simulation),
         "results": tabulate(
             "How both simulations end",
-            _without_repetition(RESULTS, simulation),
+            _without_repetition(COLUMNS_BY_TABLE["results"], simulation),
             results,
             words={name: name.replace("_", " ") for name in units},
-            lead_rows=[row for row, name in enumerate(units) if name not in OF_SEARCH],
+            lead_rows=[
+                row for row, name in enumerate(units) if name not in SEARCH_RESULTS
+            ],
         ),
     }
 
@@ -107,7 +116,7 @@ def answer_of_setting(
         points = points_in_words(vehicle, failing, len(system.matrix))
         sentences.append(evidence(points))
 
-    rows = [(remark,) for remark in dict.fromkeys(remarks) if remark]
+    rows = [{"remark": remark} for remark in dict.fromkeys(remarks) if remark]
     tables["remarks"] = tabulate("Remarks", REMARKS, rows)
     named = system.characteristics.named(setting)
     places = [
@@ -115,11 +124,13 @@ def answer_of_setting(
         for item in system.characteristics.scenario
         if item.name != PHASE and named[item.name] != item.original
     ]
-    if texts := change_texts(system.characteristics.vehicle, named):
+    texts = change_texts(system.characteristics.vehicle, named)
+    if texts:
         sentences.append(words.CHANGES(changes=", ".join(texts)))
     if places:
         sentences.append(words.ENCOUNTER(values=join_phrases(places)))
-    if phase := named.get(PHASE):
+    phase = named.get(PHASE)
+    if phase:
         sentences.append(words.LATER(phase=phase))
     if handle is not None:
         numbers = {"solution": str(handle), **numbers}
@@ -137,12 +148,14 @@ def _points(system: System, setting: FloatArray) -> tuple[AnswerTable, list[str]
     """The table of the points of a matrix, in which the worst points come first; and the names of
     the points at which a setting fails.
     """
-    results = list(simulate_all_points(system, setting[None]))
+    results = list(simulate_all_points(system, setting[np.newaxis]))
     records = (point_record(result) for result in results)
     # A contact is a record in a record: its side and its place become columns.
     points = pd.DataFrame([{**row, **row.get("contact", {})} for row in records])
     worst = np.argsort(points[SAFETY_DEGREE], kind="stable").tolist()
-    table = tabulate("Test cases, worst first", POINTS, points, lead_rows=worst)
+    table = tabulate(
+        "Test cases, worst first", COLUMNS_BY_TABLE["points"], points, lead_rows=worst
+    )
     return table, [result.point.name for result in results if _fails(system, result)]
 
 
@@ -159,14 +172,22 @@ def _without_repetition(
 
 
 def _characteristics(simulation: Simulation) -> AnswerTable:
+    """The table of the values of all characteristics."""
     pairs = zip(
         CharacteristicSet.of(simulation.study), simulation.setting.values(), strict=True
     )
-    rows = (
-        (item.name, item.unit, item.original, value, value != item.original, item.words)
+    rows = [
+        {
+            "characteristic": item.name,
+            "unit": item.unit,
+            "original": item.original,
+            "simulated": value,
+            "changed": value != item.original,
+            "meaning": item.words,
+        }
         for item, value in pairs
-    )
-    columns = _without_repetition(CHARACTERISTICS, simulation)
+    ]
+    columns = _without_repetition(COLUMNS_BY_TABLE["characteristics"], simulation)
     return tabulate(simulation.study.title, columns, rows)
 
 
@@ -176,14 +197,14 @@ def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
     """
     is_changed = simulation.row > 0
     test = simulation.pair.point.name
-    templates = words.ORIGINAL, words.CHANGED
+    template = words.CHANGED if is_changed else words.ORIGINAL
     if point_count > 1:
-        templates = words.ORIGINAL_IN_WORST, words.CHANGED_IN_WORST
+        template = words.CHANGED_IN_WORST if is_changed else words.ORIGINAL_IN_WORST
     elif test:
-        templates = words.ORIGINAL_IN_TEST, words.CHANGED_IN_TEST
+        template = words.CHANGED_IN_TEST if is_changed else words.ORIGINAL_IN_TEST
     sentences = [
         answer(simulation.no_verdict),
-        templates[is_changed](
+        template(
             original=simulation.original.verdict,
             changed=simulation.verdict,
             number=point_count,
@@ -204,11 +225,9 @@ def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
 
 def _comparison_of_runs(simulation: Simulation) -> list[Sentence]:
     """Sentences that compare the mean safety degrees of the repeated runs of both vehicles."""
-    samples = [
-        np.array([run.f_safe[0] for run in vehicle.evaluation.repeats])
-        for vehicle in (simulation, simulation.original)
-    ]
-    difference, low, high = difference_of_means(*samples)
+    changed = [run.f_safe[0] for run in simulation.evaluation.repeats]
+    original = [run.f_safe[0] for run in simulation.original.evaluation.repeats]
+    difference, low, high = difference_of_means(np.array(changed), np.array(original))
     if np.isnan(difference):
         return [words.UNDECIDED]
     conclusion = words.NO_DIFFERENCE
@@ -238,9 +257,8 @@ def _safety_comparison(simulation: Simulation) -> Sentence:
     """
     changed = simulation.metrics
     original = simulation.original.metrics
-    stop, original_stop = (
-        metrics.get(STOPPING_DISTANCE.name, np.nan) for metrics in (changed, original)
-    )
+    stop = changed.get(STOPPING_DISTANCE.name, np.nan)
+    original_stop = original.get(STOPPING_DISTANCE.name, np.nan)
     if np.isfinite(stop / original_stop):
         return words.STOPPING_DISTANCE(factor=stop / original_stop)
     gain = changed[SAFETY_DEGREE] - original[SAFETY_DEGREE]

@@ -33,11 +33,9 @@ from safevar_sumo.replay.comparison import (
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.setting import (
-    CHARACTERISTICS,
+    COLUMNS_BY_TABLE,
     OUTCOME_NAMES,
-    POINTS,
     REMARKS,
-    RESULTS,
     answer_of_setting,
 )
 from safevar_sumo.results import (
@@ -77,9 +75,7 @@ class Target(NamedTuple):
 
 @contents(
     *("solution", *OUTCOME_NAMES, ...),
-    characteristics=CHARACTERISTICS,
-    results=RESULTS,
-    points=POINTS,
+    **COLUMNS_BY_TABLE,
     remarks=REMARKS,
 )
 def show_simulation(
@@ -150,7 +146,9 @@ def show_simulation(
         requested = np.array(list({**target_values, **values}.values()))
         # Without changes the setting is that of a study or of results, which has been checked.
         if changes and not beyond:
-            system.region.check(requested[None], otherwise=", or any with --beyond")
+            system.region.check(
+                requested[np.newaxis], otherwise=", or any with --beyond"
+            )
 
     # Files that cannot be written are refused first.
     if trace is not None:
@@ -239,7 +237,8 @@ def load_target(
         )
     row = row_of_handle(subject.solutions, handle)
     values: dict[Any, Any] = subject.solutions.iloc[row].to_dict()
-    if choice == "fewest" and (fewest := fewest_changes(subject)):
+    fewest = fewest_changes(subject) if choice == "fewest" else None
+    if fewest:
         values = subject.characteristics.named(fewest.settings[0])
     return Target(study, source, handle, values)
 
@@ -258,6 +257,6 @@ def _with_set(study: Study, fit: int) -> Study:
 def _warn_of_differences(
     target: Target, row: JsonObject, simulation: Simulation
 ) -> None:
-    why = why_different(is_imported="run" not in row)
+    reason = why_different(is_imported="run" not in row)
     for difference in list_differences(simulation.evaluation, row):
-        warn(f"{target.handle} of {target.source}: {difference}; {why}")
+        warn(f"{target.handle} of {target.source}: {difference}; {reason}")

@@ -41,7 +41,6 @@ from safevar_sumo.report.budget import REPLAYS
 from safevar_sumo.report.pack import (
     DESCRIPTION,
     PACK,
-    FileContents,
     PackedManifest,
     PackedStudy,
     json_of,
@@ -52,6 +51,7 @@ from safevar_sumo.report.sheet import with_answers
 from safevar_sumo.report.texts import answer_about, completed, parse_question
 from safevar_sumo.results import (
     MANIFEST,
+    NO_RUN,
     SOLUTIONS,
     RunName,
     changed_values,
@@ -122,6 +122,25 @@ class Claim(NamedTuple):
     compute: Callable[[], bytes] | None
 
 
+class ClaimVerdict(NamedTuple):
+    """The verdict on a claim, a row of the table `CLAIMS`. If the content here differs from the
+    claimed content, `packed` and `here` have the first line that differs.
+    """
+
+    study: str
+    claim: str
+    verdict: str
+    packed: str = ""
+    here: str = ""
+
+
+class Recomputed(NamedTuple):
+    """The contents of two claims, computed together: about outcomes, and the table of solutions."""
+
+    outcomes: bytes
+    solutions: bytes
+
+
 class Packed:
     """A study in a pack: all claims follow from its description, manifest, solutions and code.
 
@@ -131,7 +150,7 @@ class Packed:
     def __init__(
         self,
         packed: PackedStudy,
-        files: FileContents,
+        files: dict[str, bytes],
         places: Sequence[str],
         jobs: int | None,
         progress: Progress,
@@ -177,7 +196,8 @@ class Packed:
         """Refuse claims that no intact pack has, before anything is computed."""
         outcomes = self.packed.outcomes
         runs = self.packed.runs
-        if unknown := outcomes.keys() - set(Outcome):
+        unknown = outcomes.keys() - set(Outcome)
+        if unknown:
             raise ValueError(f"there is no outcome {min(unknown)!r}")
         if not set(runs) <= set(all_runs(study)) or len(runs) > len({*runs}):
             raise ValueError(f"the study has no such runs: {runs[:3]}")
@@ -204,13 +224,12 @@ class Packed:
                 raise InputError(
                     "ask", f"{text!r} writes a file", "a question without --out"
                 )
-        named = [
-            name for question in self.packed.questions if (name := list_in(question))
-        ]
+        lists = [list_in(question) for question in self.packed.questions]
+        list_names = [name for name in lists if name]
         packed = [name for name in self.files if name.startswith(f"{LISTS}/")]
-        if sorted(named) != sorted(packed):
+        if sorted(list_names) != sorted(packed):
             raise ValueError(
-                f"{LISTS}: {packed or 'nothing'} instead of {named or 'nothing'}"
+                f"{LISTS}: {packed or 'nothing'} instead of {list_names or 'nothing'}"
             )
 
     def _check_solutions(self, study: Study, solutions: pd.DataFrame) -> None:
@@ -220,7 +239,8 @@ class Packed:
         columns = {"algorithm", "run", *study.domains, *self.manifest["original"]}
         expected = columns - {"collision", "collision_speed"}
         # If two columns are called x, pandas calls the second one "x.1".
-        if wrong := expected ^ {*solutions}:
+        wrong = expected ^ {*solutions}
+        if wrong:
             raise ValueError(
                 f"{SOLUTIONS}: the column {min(wrong)} is missing, new or there twice"
             )
@@ -228,7 +248,8 @@ class Packed:
             raise ValueError(f"{SOLUTIONS} has other rows than {DESCRIPTION} says")
         different = solutions.drop_duplicates(["algorithm", "run", *study.domains])
         for outcome, count in different["outcome"].value_counts().items():
-            if count > (stated := self.packed.outcomes.get(str(outcome), 0)):
+            stated = self.packed.outcomes.get(str(outcome), 0)
+            if count > stated:
                 raise ValueError(
                     f"{count} solutions of {stated} simulations have {outcome}"
                 )
@@ -263,7 +284,8 @@ class Packed:
         values = completed(question, values, self.unsafe, part, quick=False)
         case = judged if values.get("unsafe") == self.unsafe else self.case
         with temporary_folder() as folder:
-            if name := values.get(CARS):
+            name = values.get(CARS)
+            if name:
                 path = Path(folder, name)
                 path.parent.mkdir()
                 path.write_bytes(self.files[name])
@@ -322,7 +344,7 @@ class Packed:
             return path.read_bytes().partition(b"\n")[2]
 
     @cached_property
-    def simulated(self) -> tuple[bytes, bytes]:
+    def simulated(self) -> Recomputed:
         """The evaluation of the original vehicle, and the table of solutions, simulated again."""
         names = self.case.characteristics.names
         settings = self.case.settings
@@ -330,14 +352,16 @@ class Packed:
             self.case.study, settings, jobs=self._jobs, progress=self._progress
         )
         frame = evaluations_frame(
-            names, [(("", 0), evaluations.take(range(1, len(settings))))]
+            names, [(NO_RUN, evaluations.take(range(1, len(settings))))]
         )
         runs = self.case.solutions[["algorithm", "run"]]
         frame[["algorithm", "run"]] = runs.to_numpy()
-        return json_bytes(record(evaluations)), csv_of(in_order(frame, names))
+        return Recomputed(
+            json_bytes(record(evaluations)), csv_of(in_order(frame, names))
+        )
 
     @cached_property
-    def searched(self) -> tuple[bytes, bytes]:
+    def searched(self) -> Recomputed:
         """Numbers of evaluations by outcome, and the table of solutions, of the same runs again."""
         with temporary_folder() as folder:
             results = run(
@@ -347,7 +371,9 @@ class Packed:
                 progress=self._progress,
                 only=self.packed.runs,
             )
-            return json_bytes(count_outcomes(results.case)), csv_of(results.solutions)
+            return Recomputed(
+                json_bytes(count_outcomes(results.case)), csv_of(results.solutions)
+            )
 
     @property
     def versions(self) -> tuple[JsonObject, JsonObject]:
@@ -373,9 +399,9 @@ class Packed:
         yield Claim(
             "original vehicle",
             json_bytes(self.manifest["original"]),
-            lambda: self.simulated[0],
+            lambda: self.simulated.outcomes,
         )
-        yield Claim("solutions", solutions, lambda: self.simulated[1])
+        yield Claim("solutions", solutions, lambda: self.simulated.solutions)
         for text, answer in zip(
             self.packed.questions, json_of(self.files[ANSWERS]), strict=True
         ):
@@ -384,12 +410,12 @@ class Packed:
             )
         yield Claim("report", self.files[PAGE], self.page)
 
-        outcomes = "search: outcomes", json_bytes(self.packed.outcomes)
+        outcomes = Claim("search: outcomes", json_bytes(self.packed.outcomes), None)
         if not search:
-            yield Claim(*outcomes, None)
+            yield outcomes
             return
-        yield Claim(*outcomes, lambda: self.searched[0])
-        yield Claim("search: solutions", solutions, lambda: self.searched[1])
+        yield outcomes._replace(compute=lambda: self.searched.outcomes)
+        yield Claim("search: solutions", solutions, lambda: self.searched.solutions)
 
     @property
     def code(self) -> list[str]:
@@ -405,12 +431,12 @@ class Packed:
             for name in self.files
             if name.startswith(prefix) and not name.endswith(".csv")
         ]
-        named = [
+        code_names = [
             name
             for name in (*study.search.algorithms, *self.packed.questions)
             if ":" in name.partition(" ")[0] and not name.startswith(PYMOO)
         ]
-        return [*files, *user_code_names(study), *named]
+        return [*files, *user_code_names(study), *code_names]
 
 
 def list_in(text: str) -> str:
@@ -468,18 +494,18 @@ def count_solutions(solutions: pd.DataFrame, runs: Sequence[RunName]) -> list[in
     return [*(counts[run] for run in runs), len(solutions), len(distinct)]
 
 
-def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
-    """Compute a claim again and compare it. Returns a row of `CLAIMS`, with the first line that
-    differs, as claimed and as computed.
-    """
+def compare_claim(study: str, claim: Claim) -> ClaimVerdict:
+    """Compute a claim about a study again and compare it."""
     if claim.compute is None:
-        return study, claim.name, UNCHECKED, "", "--search repeats the search"
+        remark = "--search repeats the search"
+        return ClaimVerdict(study, claim.name, UNCHECKED, here=remark)
     try:
         computed = claim.compute()
     except SafevarError as error:
-        return study, claim.name, CANNOT, "", " ".join(str(error).split())
+        reason = " ".join(str(error).split())
+        return ClaimVerdict(study, claim.name, CANNOT, here=reason)
     if claim.packed == computed:
-        return study, claim.name, SAME, "", ""
+        return ClaimVerdict(study, claim.name, SAME)
 
     packed_lines = [*claim.packed.decode().splitlines(keepends=True), "nothing"]
     lines = [*computed.decode().splitlines(keepends=True), "nothing"]
@@ -491,13 +517,13 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
     if max(len(packed_line), len(line)) > SHOWN:
         start = max(_first_difference(packed_line, line) - CONTEXT, 0)
     part = slice(start, start + SHOWN)
-    return study, claim.name, DIFFERS, packed_line[part], line[part]
+    return ClaimVerdict(study, claim.name, DIFFERS, packed_line[part], line[part])
 
 
 def _first_difference(sequence: Sequence[str], counterpart: Sequence[str]) -> int:
     """The index of the first elements in which two sequences differ."""
     pairs = enumerate(zip_longest(sequence, counterpart))
-    return next(index for index, pair in pairs if pair[0] != pair[1])
+    return next(index for index, (item, other) in pairs if item != other)
 
 
 def _shown(line: str, counterpart: str) -> str:

@@ -64,7 +64,6 @@ from safevar_sumo.report.pack import (
     DESCRIPTION,
     PACK,
     Description,
-    FileContents,
     PackedManifest,
     PackedStudy,
     digest_of,
@@ -150,12 +149,12 @@ def evidence(
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         for number, directory in enumerate(directories, 1):
             part = simulations and simulations // len(directories)
-            described, study_files = _pack_study(
+            packed_study, study_files = _pack_study(
                 number, directory, ask, unsafe, workers, show, part
             )
-            studies.append(described)
+            studies.append(packed_study)
             for name, content in study_files.items():
-                files[f"{described.folder}/{name}"] = content
+                files[f"{packed_study.folder}/{name}"] = content
     write_pack(out, studies, files)
     return (
         f"The pack is {out} ({out.stat().st_size / 1e6:.2f} MB). The SHA-256 digest of the pack is"
@@ -171,7 +170,7 @@ def _pack_study(
     workers: JsonObject,
     progress: Progress,
     simulations: int | None,
-) -> tuple[PackedStudy, FileContents]:
+) -> tuple[PackedStudy, dict[str, bytes]]:
     """Describe results as a study of a pack. Returns the description, and the contents of the
     study's files by name.
     """
@@ -231,12 +230,12 @@ def _pack_study(
     return msgspec.structs.replace(described, simulations=packed.simulations()), files
 
 
-def _with_lists(questions: Sequence[str]) -> tuple[list[str], FileContents]:
+def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:
     """The questions, in which lists of cars have their names in the pack; and the contents of these
     lists, without the names of cars.
     """
     packed = []
-    lists = FileContents()
+    lists = dict[str, bytes]()
     for text in questions:
         path = list_in(text)
         if not path:
@@ -251,7 +250,7 @@ def _with_lists(questions: Sequence[str]) -> tuple[list[str], FileContents]:
 
 def _files_of_user(
     study: Study, named: Iterable[str], questions: Sequence[str]
-) -> FileContents:
+) -> dict[str, bytes]:
     """The contents of the user's files by their names in a pack: files on which the results depend
     (`named`), code of the user's questions, and views of networks.
     """
@@ -274,11 +273,14 @@ def _files_of_user(
     for name in names[:]:
         if Path(name).name == OPTIONS_FILE:
             options = options_in(Path(file_by_name(name, places)))
-            if view := options.get("gui-settings-file"):
+            view = options.get("gui-settings-file")
+            if view:
                 names.append(str(Path(name).with_name(view)))
-    paths = {
-        name: Path(place) for name in names if (place := file_by_name(name, places))
-    }
+    paths = {}
+    for name in names:
+        place = file_by_name(name, places)
+        if place:
+            paths[name] = Path(place)
 
     modules = [
         text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]
@@ -348,17 +350,18 @@ def verify(
             _refuse_code(path, studies.values())
 
         names = ", ".join(packed.case.study.name for packed in studies.values())
-        of_files = Claim(
+        files_claim = Claim(
             "files",
             json_bytes(description.files),
             lambda: json_bytes(digests_of(files)),
         )
-        rows = [compare_claim(names, of_files)]
+        verdicts = [compare_claim(names, files_claim)]
         for place, packed in studies.items():
             with only_from(str(place / CODE)):
                 for claim in packed.claims(place, search):
-                    rows.append(compare_claim(packed.case.study.name, claim))
+                    verdicts.append(compare_claim(packed.case.study.name, claim))
 
+    rows = [verdict._asdict() for verdict in verdicts]
     claims = tabulate("Claims", CLAIMS, rows)
     counts = Counter(claims.frame["verdict"])
     sentences = _count_sentences(counts)
@@ -388,7 +391,7 @@ ALTERED = "This pack was altered: its files are not those that its description l
 
 
 def _refuse_files_without_study(
-    pack: Path, files: FileContents, studies: Iterable[Packed]
+    pack: Path, files: dict[str, bytes], studies: Iterable[Packed]
 ) -> None:
     """Refuse a pack that holds a file of none of its studies."""
     unknown = {*files}
@@ -443,7 +446,7 @@ def _not_compared(description: Description, studies: Iterable[Packed]) -> list[s
 def _unpack(
     path: Path,
     described: PackedStudy,
-    files: FileContents,
+    files: dict[str, bytes],
     folder: Path,
     jobs: int | None,
     progress: Progress,

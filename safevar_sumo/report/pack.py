@@ -22,15 +22,12 @@ from msgspec import Meta, Struct
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Scoring
 from safevar_sumo.output import MAX_UNPACKED, read_file, whole_file
-from safevar_sumo.plugins import Files
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results.identity import PACKAGES
 from safevar_sumo.results.manifest import OriginalRecord
 from safevar_sumo.study import Study
 
 DESCRIPTION = "pack.json"
-FileContents = dict[str, bytes]
-"""Contents of files, by their names."""
 MAX_FILES = 10_000
 MAX_PACK_EVALUATIONS = 100_000_000
 MORE_IN_DIRECTORY = 16
@@ -86,7 +83,7 @@ class PackedManifest(Struct, frozen=True, forbid_unknown_fields=True):
 
     format: int
     study: Study
-    files: Files
+    files: dict[str, str]
     results: int
     platform: PackedPlatform
     versions: dict[str, str]
@@ -98,11 +95,11 @@ class Description(Struct, frozen=True, forbid_unknown_fields=True):
     """The file `pack.json`. `files` has the sha256 of all other files of the pack, by name."""
 
     versions: dict[str, str]
-    files: Files
+    files: dict[str, str]
     studies: Annotated[list[PackedStudy], Meta(min_length=1)]
 
 
-def write_pack(path: Path, studies: list[PackedStudy], files: FileContents) -> None:
+def write_pack(path: Path, studies: list[PackedStudy], files: dict[str, bytes]) -> None:
     """Write a pack; equal contents give equal bytes."""
     described = msgspec.json.encode(
         Description(versions_here(), digests_of(files), studies)
@@ -146,7 +143,7 @@ def json_of(content: bytes) -> Any:
     return value
 
 
-def digests_of(files: FileContents) -> dict[str, str]:
+def digests_of(files: dict[str, bytes]) -> dict[str, str]:
     """The sha256 of files, by name."""
     return {name: sha256(files[name]).hexdigest() for name in sorted(files)}
 
@@ -157,7 +154,7 @@ def digest_of(path: Path) -> str:
         return file_digest(file, "sha256").hexdigest()
 
 
-def read_pack(path: Path) -> tuple[Description, FileContents]:
+def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
     """Read a pack into memory.
 
     Raises
@@ -240,7 +237,8 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
             path,
             f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once",
         )
-    if (size := sum(entry.file_size for entry in entries)) > MAX_UNPACKED:
+    size = sum(entry.file_size for entry in entries)
+    if size > MAX_UNPACKED:
         _refuse(
             path,
             f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_UNPACKED / 1e9:g} are allowed",

@@ -167,25 +167,30 @@ def report(
     joint = _joint_questions(ask, len(cases))
     alone = [text for text in ask if text not in joint]
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
-    at_point = _cases_asked_about(cases, point, quick=quick)
+    point_cases = _cases_asked_about(cases, point, quick=quick)
     key = f"report {paths} {point} {ask} {criterion} {quick}"
     with (
         open_progress(progress) as show,
         keep_simulations(key, fresh=fresh),
         ExitStack() as stack,
     ):
-        by_criterion = cases_by(at_point, criterion, jobs, show_no_progress, cluster)
+        criterion_cases = cases_by(
+            point_cases, criterion, jobs, show_no_progress, cluster
+        )
         questions = (
             [alone] * len(cases)
             if ask
-            else [usual_questions(case) for case in by_criterion]
+            else [usual_questions(case) for case in criterion_cases]
         )
-        texts_of = list(map(with_speed_part, questions, by_criterion))
+        texts_of = [
+            with_speed_part(texts, case)
+            for texts, case in zip(questions, criterion_cases, strict=True)
+        ]
         texts = [*chain(*texts_of), *joint]
         # Joint questions take a part from the first results.
         texts_of[0] += joint
         budgets = parts_of_simulations(
-            at_point, by_criterion, point, texts_of, simulations
+            point_cases, criterion_cases, point, texts_of, simulations
         )
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)
@@ -196,8 +201,8 @@ def report(
         costs += PAGE_COSTS * len(cases)
         if simulations:
             # The bar counts the simulations that the user allows.
-            whole = sum(costs)
-            costs = [simulations * cost // whole for cost in costs]
+            total_cost = sum(costs)
+            costs = [simulations * cost // total_cost for cost in costs]
         progress_parts = Parts(show, costs)
 
         def next_answer(
@@ -209,7 +214,9 @@ def report(
             values = completed(question, values, criterion, budget, quick=quick)
             # A question with another criterion than the page, or without any, must not get results
             # that are adapted to the page's criterion.
-            subjects = by_criterion if values.get("unsafe") == criterion else at_point
+            subjects = (
+                criterion_cases if values.get("unsafe") == criterion else point_cases
+            )
             name = f"question {next(numbers)} of {len(texts)}, {question.name}"
             return answer_about(
                 question,
@@ -229,7 +236,7 @@ def report(
         for number, path in enumerate(paths):
             study = ReportedStudy(
                 directory=path,
-                case=by_criterion[number],
+                case=criterion_cases[number],
                 versions=read_manifest(path)["versions"],
                 point=point or "",
                 later_changes=later_changes[number],
@@ -237,7 +244,7 @@ def report(
             )
             ask_study = partial(next_answer, slice(number, number + 1))
             studies.append(with_answers(study, questions[number], ask_study))
-        shared = list(map(partial(next_answer, slice(None)), joint))
+        shared = [next_answer(slice(None), text) for text in joint]
         # Close the pool of workers: this process simulates the replays.
         stack.close()
         write_whole(out, make_page(studies, progress_parts, shared))
@@ -258,8 +265,8 @@ def _cases_asked_about(
 
 
 def parts_of_simulations(
-    at_point: Sequence[Case],
-    by_criterion: Sequence[Case],
+    point_cases: Sequence[Case],
+    criterion_cases: Sequence[Case],
     point: str | None,
     texts_of: Sequence[Sequence[str]],
     simulations: int | None,
@@ -273,7 +280,9 @@ def parts_of_simulations(
     if simulations is None:
         return [{}] * len(texts_of)
     budgets = []
-    for case, adapted, texts in zip(at_point, by_criterion, texts_of, strict=True):
+    for case, adapted, texts in zip(
+        point_cases, criterion_cases, texts_of, strict=True
+    ):
         system = assemble(adapted.study)
         # The solutions are simulated at the point, and again if the criterion changes the study.
         is_at_point = point is not None
@@ -361,10 +370,10 @@ def make_page(
         if answer.command:
             commands.append((f"The answer {answer.question}", answer.command))
     template = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2")
-    described = [_study_parts(*pair, parts) for pair in enumerate(studies, 1)]
+    study_parts = [_study_parts(*pair, parts) for pair in enumerate(studies, 1)]
     page = template.render(
         title=f"Safety report: {names}",
-        studies=described,
+        studies=study_parts,
         shared=list(_sections("all", shared)),
         commands=commands,
         css=Markup((TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")),

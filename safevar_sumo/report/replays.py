@@ -70,10 +70,10 @@ def replays(
             "player": player_of(comparison, start + number),
         }
     if different:
-        why = why_different(is_imported=not study.case.has_runs)
+        reason = why_different(is_imported=not study.case.has_runs)
         warn(
             f"{study.directory}: simulated again with different results: {', '.join(different)};"
-            f" {why}"
+            f" {reason}"
         )
 
 

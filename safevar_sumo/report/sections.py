@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +58,8 @@ GENERAL_LIMITS = (
         " agree with published data, where such data exist."
     ),
 )
-CHARACTERISTICS, AGREEMENT, SPREAD, PUBLISHED = shipped_columns("report").values()
+COLUMNS_BY_TABLE = shipped_columns("report")
+"""The columns of the tables of both sections, by the names of the tables in columns.toml."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,10 +150,18 @@ def tested(study: ReportedStudy) -> Answer:
         if table.model
     ]
 
-    facts = attrgetter(
-        "name", "unit", "original", "lower", "upper", "threshold", "words"
-    )
-    rows = (facts(item) for item in case.characteristics)
+    rows = [
+        {
+            "characteristic": item.name,
+            "unit": item.unit,
+            "original": item.original,
+            "lowest": item.lower,
+            "highest": item.upper,
+            "threshold": item.threshold,
+            "meaning": item.words,
+        }
+        for item in case.characteristics
+    ]
     remarks = [*case.remarks, *vehicle_remarks(study.system)]
     sentences = [*models, _scenario(study), *counted_in_words(case.study)]
     sentences += [_search(study), pre_crash_sentence(study.system.points)]
@@ -164,7 +172,9 @@ def tested(study: ReportedStudy) -> Answer:
         numbers={},
         tables={
             "characteristics": tabulate(
-                "Characteristics and their domains", CHARACTERISTICS, rows
+                "Characteristics and their domains",
+                COLUMNS_BY_TABLE["characteristics"],
+                rows,
             ),
             "remarks": _remarks(remarks),
         },
@@ -174,7 +184,9 @@ def tested(study: ReportedStudy) -> Answer:
 
 def _remarks(texts: Sequence[str]) -> AnswerTable:
     return tabulate(
-        "Remarks", {"remark": "what to bear in mind"}, [(text,) for text in texts]
+        "Remarks",
+        {"remark": "what to bear in mind"},
+        [{"remark": text} for text in texts],
     )
 
 
@@ -248,7 +260,7 @@ def trust(study: ReportedStudy) -> Answer:
     agreement = shipped_agreement(case.study)
     if len(agreement):
         title = "Agreement of the safety degrees with published data"
-        tables["agreement"] = tabulate(title, AGREEMENT, agreement)
+        tables["agreement"] = tabulate(title, COLUMNS_BY_TABLE["agreement"], agreement)
         ends = [f"{agreement['spearman'].agg(end):.2f}" for end in ("min", "max")]
         sentences = [
             "Nothing was compared with a real car. The safety degrees were compared with"
@@ -263,23 +275,37 @@ def trust(study: ReportedStudy) -> Answer:
         spreads = compute_model_spreads(case.study, settings, study.point)
         degrees = [case.original[SAFETY_DEGREE], *study.chosen_solutions["f_safe"]]
         rows = [
-            (name, degree, spread.lower, spread.upper, spread.sets, spread.collisions)
+            {
+                "vehicle": name,
+                "safety_degree": degree,
+                "safety_degree_low": spread.lower,
+                "safety_degree_high": spread.upper,
+                "sets": spread.sets,
+                "collisions": spread.collisions,
+            }
             for name, degree, spread in zip(
                 ["original", *study.choices], degrees, spreads, strict=True
             )
         ]
         title = "Uncertainty of the vehicle model: safety degree with its other parameter sets"
-        tables["spread"] = tabulate(title, SPREAD, rows)
+        tables["spread"] = tabulate(title, COLUMNS_BY_TABLE["spread"], rows)
 
     # The quotient is safe: a study refuses a published value of 0.
-    published = [
-        (name, value, metric, 100 * (metric / value - 1))
-        for name, value in case.study.published.items()
-        if not math.isnan(metric := case.original.get(name, math.nan))
-    ]
+    published = []
+    for name, value in case.study.published.items():
+        metric = case.original.get(name, math.nan)
+        if not math.isnan(metric):
+            published.append(
+                {
+                    "metric": name,
+                    "published": value,
+                    "here": metric,
+                    "difference": 100 * (metric / value - 1),
+                }
+            )
     tables["original"] = tabulate(
         "Metrics of the original vehicle, published and simulated here",
-        PUBLISHED,
+        COLUMNS_BY_TABLE["published"],
         published,
     )
 

@@ -122,18 +122,18 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     }
 
 
-def _row_of_part(item: Characteristic, row: JsonObject | None) -> tuple[str, ...]:
+def _row_of_part(item: Characteristic, row: JsonObject | None) -> dict[str, str]:
     """The row of `SHEET_PARTS` about one item. `row` is its row in the table of limits, if it has
     one.
     """
     name = item.meaning or item.short_name
-    return (
-        name[:1].upper() + name[1:],
-        item.measurement,
-        _limit_in_words(item, row),
-        f"{BLANK}{item.suffix}",
-        item.remedy or UNSAID,
-    )
+    return {
+        "item": name[:1].upper() + name[1:],
+        "how to measure": item.measurement,
+        "limit": _limit_in_words(item, row),
+        "measured": f"{BLANK}{item.suffix}",
+        "beyond the limit": item.remedy or UNSAID,
+    }
 
 
 def speed_values(study: ReportedStudy) -> JsonObject:
@@ -184,9 +184,10 @@ def with_answers(
 
 
 def _limits_of(study: ReportedStudy) -> Answer | None:
-    return next(
-        (answer for answer in study.answers if answer.question == "tolerance"), None
-    )
+    for answer in study.answers:
+        if answer.question == "tolerance":
+            return answer
+    return None
 
 
 def _rows_of(limits: Answer) -> dict[str, JsonObject]:
@@ -245,7 +246,8 @@ def _is_relative(case: Case, unsafe: Unsafe) -> bool:
 
 def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     """The reason why nobody may work by this sheet, as a sentence; "" if somebody may."""
-    if reason := _why_no_joint_limits(limits):
+    reason = _why_no_joint_limits(limits)
+    if reason:
         return reason
     items = study.case.characteristics.vehicle
     rows = _rows_of(limits)

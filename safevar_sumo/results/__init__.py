@@ -34,6 +34,7 @@ from safevar_sumo.results.manifest import (
     write_whole as write_whole,
 )
 from safevar_sumo.results.store import (
+    NO_RUN as NO_RUN,
     UNKNOWN as UNKNOWN,
     ResultsDirectory as ResultsDirectory,
     RunName as RunName,

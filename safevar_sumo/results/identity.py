@@ -90,15 +90,15 @@ def _without_ranges(tables: Tables) -> JsonObject:
 
     def lists(table: JsonObject) -> JsonObject:
         """A table whose axes in `over` have only their listed values."""
-        listed = dict(table)
+        changed_table = dict(table)
         over = {}
-        for name, axis in listed.pop("over", {}).items():
+        for name, axis in changed_table.pop("over", {}).items():
             values = axis.get("at") if isinstance(axis, dict) else axis
             if values:
                 over[name] = values
         if over:
-            listed["over"] = over
-        return listed
+            changed_table["over"] = over
+        return changed_table
 
     result = {**tables, "scenario": lists(tables["scenario"])}
     result["scenario"].pop("margin", None)

@@ -351,9 +351,9 @@ def _checked(text: bytes, checksum: int) -> tuple[JsonObject, int]:
     this line. The content is empty if the line is torn, damaged or altered. `checksum` is the
     checksum of all lines before it.
     """
-    content, _, stated = text.rpartition(CHECKSUM_MARK)
+    content, _, stated_checksum = text.rpartition(CHECKSUM_MARK)
     checksum = zlib.crc32(content + b"}", checksum)
-    if stated != b"%d}\n" % checksum:
+    if stated_checksum != b"%d}\n" % checksum:
         return {}, checksum
     return _decoded(content + b"}\n"), checksum
 

@@ -13,7 +13,6 @@ from msgspec import Struct
 
 from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.output import read_file, whole_file
-from safevar_sumo.plugins import Files
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results.identity import FORMAT
 from safevar_sumo.study import Study, convert_table
@@ -146,7 +145,7 @@ class _Manifest(Struct):
     study: Study
     versions: dict[str, str]
     original: OriginalRecord
-    files: Files = {}
+    files: dict[str, str] = {}
     folders: list[str] = []
 
 

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 RunName = tuple[str, int]
 """An algorithm, and the number of a run."""
+NO_RUN: RunName = ("", 0)
+"""The name that stands for a run where evaluations belong to no run."""
 RunKeyT = TypeVar("RunKeyT", bound=RunName)
 """The type of the keys by which a caller names its runs: a `RunName`, or a subtype."""
 
@@ -113,10 +115,12 @@ class ResultsDirectory:
         """
         # Another process may have written results since the directory was opened.
         earlier_manifest = self._earlier_manifest()
-        now = record(original)
+        original_record = record(original)
         if self._study.scenario.repeats == 1:
-            refuse_other_original(self.path, earlier_manifest.get("original", {}), now)
-        write_manifest(self.path, {**self.manifest, "original": now})
+            refuse_other_original(
+                self.path, earlier_manifest.get("original", {}), original_record
+            )
+        write_manifest(self.path, {**self.manifest, "original": original_record})
         if earlier_manifest and (
             search_extent_of(earlier_manifest) != search_extent_of(self.manifest)
         ):
@@ -222,7 +226,7 @@ def evaluations_frame(
     for _, evaluations in all_runs:
         metrics += evaluations.metrics
     # Without runs the frame has all columns, too.
-    empty = ("", 0), Evaluations.none(len(characteristics), metrics)
+    empty = Evaluations.none(len(characteristics), metrics)
     frames = [
         pd.DataFrame(
             {
@@ -236,7 +240,7 @@ def evaluations_frame(
                 "outcome": evaluations.outcome.astype(object),
             }
         )
-        for (algorithm, run), evaluations in [empty, *all_runs]
+        for (algorithm, run), evaluations in [(NO_RUN, empty), *all_runs]
     ]
     return pd.concat(frames, ignore_index=True)
 

@@ -107,9 +107,11 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
         # The distance of the middle of the target's rear to the right of the lane's middle.
         offset = lateral_offset(self.impact_location, self.vut_width)
         y = direction.left * body.length / 2 - offset
-        at_gap = Track("target", target, *body, self.gap, y, *direction, speeds)
-        first_point = first_in_strip(at_gap._replace(x=0.0), self.vut_width / 2)
-        return [at_gap._replace(x=self.gap - first_point + travelled(speeds, times))]
+        target_at_gap = Track("target", target, *body, self.gap, y, *direction, speeds)
+        first_point = first_in_strip(target_at_gap._replace(x=0.0), self.vut_width / 2)
+        return [
+            target_at_gap._replace(x=self.gap - first_point + travelled(speeds, times))
+        ]
 
 
 class Along(TargetAhead, frozen=True, kw_only=True):
@@ -345,15 +347,15 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         speed_lost = self._target_speed - self.target_speed_at(math.inf)
         closed_by_braking = (closing_speed + speed_lost / 2) * speed_lost / b
         gap_after_braking = gap_at_braking - closed_by_braking
-        after_braking = (
+        time_after_braking = (
             self.brakes_at
             + speed_lost / b
             + gap_after_braking / (closing_speed + speed_lost)
         )
         root = np.sqrt(closing_speed * closing_speed + 2 * b * gap_at_braking)
-        in_braking = self.brakes_at + (root - closing_speed) / b
+        time_in_braking = self.brakes_at + (root - closing_speed) / b
         braking = np.where(
-            gap_at_braking > closed_by_braking, after_braking, in_braking
+            gap_at_braking > closed_by_braking, time_after_braking, time_in_braking
         )
         return np.where(gap_at_braking <= 0, gap / np.float64(closing_speed), braking)[
             ()

@@ -103,7 +103,8 @@ def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
         return axes
 
     result = {**tables}
-    if isinstance(shared := scenario.get("over"), dict):
+    shared = scenario.get("over")
+    if isinstance(shared, dict):
         test: Parameters = next(iter(tests), {})
         result["scenario"] = {
             **scenario,
@@ -141,10 +142,12 @@ class _Declared:
         The original value is by default the first value of a list, or else the test's own value.
         """
         table = axis
-        if is_list := isinstance(axis, list):
+        is_list = isinstance(axis, list)
+        if is_list:
             table = {"at": axis}
         values = table.get("at", [])
-        is_fixed = is_list and (len({*map(str, values)}) < 2 or not are_numbers(values))
+        is_single = len({str(value) for value in values}) < 2
+        is_fixed = is_list and (is_single or not are_numbers(values))
         if is_fixed or {"unit", "original", "lower", "upper"} <= table.keys():
             return axis
         parameter, original = self._parameter(name, test)

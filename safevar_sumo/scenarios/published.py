@@ -207,7 +207,7 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
             yield from replace(walk, speed=slow).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        times = np.arange(samples)[:, None]
+        times = np.arange(samples)[:, np.newaxis]
         speed = self.walking_speed
         start = self.lateral_start
         if speed is None:

@@ -130,25 +130,25 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
         start = self._start
         direction = np.exp(1j * start["heading"])
         front = start["x"] + 1j * start["y"] + start["length"] / 2 * direction
-        now = times + start["time"]
+        sample_times = times + start["time"]
         tracks = []
         for name, rows in self._bodies.items():
             if name != self.ego:
                 row_times = rows["time"].to_numpy()
                 x, y, heading, speed, length, width = (
-                    np.interp(now, row_times, rows[column])
+                    np.interp(sample_times, row_times, rows[column])
                     for column in TRACK_COLUMNS[2:]
                 )
                 place = np.round((x + 1j * y - front) / direction, PLACE_DECIMALS)
                 facing = np.round(np.exp(1j * heading) / direction, PLACE_DECIMALS)
-                is_there = (now > row_times[0] - SAME_TIME) & (
-                    now < row_times[-1] + SAME_TIME
+                is_there = (sample_times > row_times[0] - SAME_TIME) & (
+                    sample_times < row_times[-1] + SAME_TIME
                 )
                 track = Track(
                     name=name,
                     kind="recorded",
-                    length=length * is_there,
-                    width=width * is_there,
+                    length=np.where(is_there, length, 0.0),
+                    width=np.where(is_there, width, 0.0),
                     x=place.real,
                     y=place.imag,
                     along=facing.real,
@@ -227,7 +227,8 @@ def _check_header(key: str, line: str) -> None:
     separator than commas. `key` is the file, for errors.
     """
     header = [name.strip().strip('"') for name in line.split(",")]
-    if len(header) == 1 and (separator := re.search("[;\\t|]", line)):
+    separator = re.search("[;\\t|]", line)
+    if len(header) == 1 and separator:
         raise InputError(
             "",
             f"{key}: its columns are separated by {separator[0]!r}",
@@ -259,12 +260,12 @@ def _check_headings(body: str, rows: pd.DataFrame) -> None:
         """The distance between the ways by places and by headings, over all steps [m]."""
         return float(np.abs(way - step * np.exp(1j * headings)).sum())
 
-    least = max(LEAST_WAY_DIFFERENCE, float(np.abs(way).sum()) / 3)
+    least_difference = max(LEAST_WAY_DIFFERENCE, float(np.abs(way).sum()) / 3)
     for meaning, degrees in (
         ("degrees", heading),
         ("degrees clockwise from y", 90.0 - heading),
     ):
-        if apart(heading) > max(least, 3 * apart(np.radians(degrees))):
+        if apart(heading) > max(least_difference, 3 * apart(np.radians(degrees))):
             raise InputError(
                 "",
                 f"{body} moves where its headings point in {meaning}",

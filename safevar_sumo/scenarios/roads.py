@@ -38,9 +38,9 @@ def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
     lane_dy = points[-1][1] - y
     length = math.hypot(lane_dx, lane_dy)
     bend = 0.0
-    for at_x, at_y in points:
-        dx = at_x - x
-        dy = at_y - y
+    for point_x, point_y in points:
+        dx = point_x - x
+        dy = point_y - y
         deviation = math.hypot(dx, dy)
         # A lane that ends at its beginning has no line through both points: the distance counts
         # instead.

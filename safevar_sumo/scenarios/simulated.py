@@ -200,8 +200,8 @@ def _contradiction(
             return f"a collision at a separation of {significant(finite.min(), 3)} m"
         impact = ends[IMPACT_SPEED]
         if np.abs(speed - impact).min() > braked + ROUNDING_SLACK:
-            last = significant(speed[-1], 3)
-            return f"{IMPACT_SPEED} = {significant(impact, 3)} after a speed of {last}"
+            last_speed = significant(speed[-1], 3)
+            return f"{IMPACT_SPEED} = {significant(impact, 3)} after a speed of {last_speed}"
         return ""
     if outcome in ENDS_APART and separation.min() <= 0:
         return f"{outcome!r} with a separation of 0"

@@ -74,9 +74,10 @@ class Ways(NamedTuple):
 
     def unexplained(self) -> FloatArray:
         """The part of each step's way that no speeds between those at its ends explain [m]."""
-        least, most = self.closing_speeds()
+        least_speed, largest_speed = self.closing_speeds()
         return np.asarray(
-            self.way - np.clip(self.way, least * self.step, most * self.step)
+            self.way
+            - np.clip(self.way, least_speed * self.step, largest_speed * self.step)
         )
 
     def compared(self) -> BoolArray:
@@ -98,7 +99,7 @@ class Ways(NamedTuple):
         unexplained = self.unexplained()[compared]
         fastest = np.max(np.abs(self.closing_speeds()), axis=0) * self.step
         largest_way = np.maximum(np.abs(self.way), fastest)[compared]
-        in_most = (
+        is_frequent = (
             np.mean(np.abs(unexplained) > UNEXPLAINED_SHARE * largest_way) > WRONG_STEPS
         )
         driven = np.maximum(np.abs(self.speed), np.abs(self.obstacle_speed))[1:]
@@ -107,7 +108,7 @@ class Ways(NamedTuple):
             UNEXPLAINED_SHARE * float(largest_way.sum()),
             SPEED_ERROR * float(driven[compared].sum()) * self.step,
         )
-        return bool(in_most and abs(float(unexplained.sum())) > allowed)
+        return bool(is_frequent and abs(float(unexplained.sum())) > allowed)
 
     def left_by(self, lag: int) -> float:
         """The sum of the unexplained ways if the speed is `lag` samples late [m]. Steps at the
@@ -152,14 +153,16 @@ def contradiction_of_speeds(
             continue
         expected = RULES[ways.name]
         compared = ways.compared()
-        own_in_ms = ways._replace(speed=ways.speed / KMH_PER_MS)
-        both_in_ms = own_in_ms._replace(obstacle_speed=ways.obstacle_speed / KMH_PER_MS)
-        for in_ms in (own_in_ms, both_in_ms):
-            unexplained = np.abs(in_ms.unexplained()[compared])
+        own_converted = ways._replace(speed=ways.speed / KMH_PER_MS)
+        both_converted = own_converted._replace(
+            obstacle_speed=ways.obstacle_speed / KMH_PER_MS
+        )
+        for converted_ways in (own_converted, both_converted):
+            unexplained = np.abs(converted_ways.unexplained()[compared])
             if unexplained.sum() < NEARLY_ALL * np.abs(ways.way[compared]).sum():
                 expected = f"speeds in m/s, not in km/h: {RULES[ways.name]}"
-        least, most = ways.closing_speeds()
-        driven = float(((least + most) / 2)[compared].sum()) * step
+        least_speed, largest_speed = ways.closing_speeds()
+        driven = float(((least_speed + largest_speed) / 2)[compared].sum()) * step
         way = float(ways.way[compared].sum())
         return Contradiction(
             f"speed and {ways.name} disagree: {significant(driven, 3)} m and"

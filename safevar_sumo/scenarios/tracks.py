@@ -96,6 +96,13 @@ class Track(NamedTuple):
     left: Quantity
     speed: Quantity
 
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """The fields with quantities, from `length` to `speed`, by name."""
+        quantities = self._asdict()
+        del quantities["name"], quantities["kind"]
+        return quantities
+
     @classmethod
     def of(
         cls,
@@ -134,10 +141,10 @@ def travelled(speeds: Quantity, times: FloatArray) -> FloatArray:
     """The distances [m] covered since the first of T `times`, shape (T, 1) [s]. Between two times,
     the speed changes linearly.
     """
-    at_times = speeds + np.zeros_like(times)
-    mean_speeds = (at_times[1:] + at_times[:-1]) / 2
+    speeds_at_times = speeds + np.zeros_like(times)
+    mean_speeds = (speeds_at_times[1:] + speeds_at_times[:-1]) / 2
     ways = mean_speeds * (times[1:] - times[:-1])
-    start = np.zeros_like(at_times[:1])
+    start = np.zeros_like(speeds_at_times[:1])
     return np.concatenate([start, np.add.accumulate(ways, axis=0)])
 
 
@@ -148,12 +155,12 @@ def first_in_strip(body: Track, half_width: float) -> Quantity:
     """
     corners = corners_of(body)
     first_x = np.full(np.broadcast(*chain(*corners)).shape, np.inf)
-    for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
+    for (x, y), (next_x, next_y) in pairwise([*corners, corners[0]]):
         first_x = np.where(np.abs(y) <= half_width, np.minimum(first_x, x), first_x)
         for side in (-half_width, half_width):
-            crosses = (np.minimum(y, to_y) < side) & (side < np.maximum(y, to_y))
-            share = (side - y) / np.where(crosses, to_y - y, 1.0)
-            crossing_x = x + (to_x - x) * share
+            crosses = (np.minimum(y, next_y) < side) & (side < np.maximum(y, next_y))
+            share = (side - y) / np.where(crosses, next_y - y, 1.0)
+            crossing_x = x + (next_x - x) * share
             first_x = np.where(crosses, np.minimum(first_x, crossing_x), first_x)
     beside = np.minimum.reduce(np.broadcast_arrays(*(x for x, _ in corners)))
     return np.where(np.isinf(first_x), beside, first_x)[()]
@@ -193,7 +200,7 @@ def check_tracks(
             "a list of safevar_sumo.scenarios.Track, of one at least",
         )
     for track in tracks:
-        for name, value in zip(Track._fields[2:], track[2:], strict=True):
+        for name, value in track.quantities.items():
             if np.asarray(value).dtype.kind not in "biuf":
                 raise code.wrong(
                     method, f"{name} = {quoted(value)} of {track.name!r}", "numbers"

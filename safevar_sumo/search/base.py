@@ -118,7 +118,7 @@ def check_search(
                 return _checked_result(code, end.value, yielded, problem)
         settings = _checked_settings(code, output, problem, budget)
         budget -= len(settings)
-        yielded.update(map(bytes, settings))
+        yielded.update(setting.tobytes() for setting in settings)
         answer = read_only((yield settings))
 
 
@@ -176,7 +176,7 @@ def _checked_result(
             f"a generator that yields from 1 to {problem.evaluations} settings",
         )
     if not isinstance(result, Evaluations) or not yielded.issuperset(
-        map(bytes, result.settings)
+        setting.tobytes() for setting in result.settings
     ):
         raise code.wrong(
             "search",

@@ -8,7 +8,6 @@ import random
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from itertools import compress
 from operator import attrgetter
 from threading import Lock
 from typing import Annotated
@@ -201,7 +200,11 @@ class Reproduction:
             self._misses = 0
             settings = self._problem.repaired(np.array(children))
             return [Individual(setting) for setting in settings.tolist()]
-        return list(compress(children, feasible))
+        return [
+            child
+            for child, is_feasible in zip(children, feasible, strict=True)
+            if is_feasible
+        ]
 
 
 def request_evaluations(
@@ -217,15 +220,16 @@ def request_evaluations(
     is_scored = np.where(
         violations > 0, np.isfinite(violations), scoring.valid(evaluated)
     )
-    columns = scoring.values(evaluated).tolist(), violations.tolist()
+    values = scoring.values(evaluated)
 
-    for row, (individual, values, violation) in enumerate(
-        zip(individuals, *columns, strict=True)
-    ):
+    scored = []
+    for row, individual in enumerate(individuals):
         individual.evaluation = (evaluated, row)
-        individual.violation = violation
-        individual.fitness = fitness(tuple(values))
-    return list(compress(individuals, is_scored))
+        individual.violation = float(violations[row])
+        individual.fitness = fitness(tuple(values[row].tolist()))
+        if is_scored[row]:
+            scored.append(individual)
+    return scored
 
 
 def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:

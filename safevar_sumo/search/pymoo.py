@@ -253,14 +253,14 @@ def _score(
     valid = scoring.valid(evaluations)
     violations = scoring.violation(evaluations)
     values = np.where(
-        valid[:, None],
+        valid[:, np.newaxis],
         scoring.values(evaluations)[:, : algorithm.problem.n_obj],
         FAILED,
     )
     violations = np.where(
         valid | (violations > 0), np.minimum(violations, FAILED), FAILED
     )
-    population.set("F", values, "G", violations[:, None])
+    population.set("F", values, "G", violations[:, np.newaxis])
     population.apply(lambda individual: individual.evaluated.update("FGH"))
     algorithm.evaluator.n_eval += len(evaluations)
 

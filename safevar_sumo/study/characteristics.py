@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from itertools import starmap
 from typing import Annotated, Any
 
 import msgspec
@@ -236,7 +235,7 @@ class Constraint(Table, frozen=True, kw_only=True):
     @property
     def quantity(self) -> str:
         """The sum in words, such as `mass - 2 radius`."""
-        text = " ".join(starmap(_term, self.sum.items()))
+        text = " ".join(_term(name, weight) for name, weight in self.sum.items())
         # "- mass" reads as a difference: a sign at the beginning of the sum stands without a space.
         return re.sub("^- ", "-", text.removeprefix("+ "))
 
@@ -268,7 +267,10 @@ class Constraint(Table, frozen=True, kw_only=True):
         """
         if self.unit is not None:
             return self.unit
-        return next((rows[name].unit for name in self.sum if name in rows), "-")
+        for name in self.sum:
+            if name in rows:
+                return rows[name].unit
+        return "-"
 
     def bounds_in_words(self, rows: Mapping[str, Domain]) -> str:
         """The bounds in words."""
@@ -286,7 +288,8 @@ def _term(name: str, weight: float) -> str:
     factor = f"{abs(weight):g} {name}"
     if abs(weight) == 1:
         factor = name
-    return f"{'+-'[weight < 0]} {factor}"
+    sign = "-" if weight < 0 else "+"
+    return f"{sign} {factor}"
 
 
 def check_bounds(at_least: float | None, at_most: float | None) -> None:

@@ -70,8 +70,10 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     dropped = _dropped_keys(base.tables, tables)
     if parts and dropped:
         differences = " and a different ".join(parts).replace("ads", "ADS")
-        of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
-        remarks = (*remarks, f"{source}: has a different {differences} {of_base}")
+        comparison = (
+            f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
+        )
+        remarks = (*remarks, f"{source}: has a different {differences} {comparison}")
     return StudyTables(source, tables, base.origin, remarks)
 
 

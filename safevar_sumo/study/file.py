@@ -154,7 +154,7 @@ def plain_values(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: plain_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return list(map(plain_values, value))
+        return [plain_values(item) for item in value]
     if hasattr(value, "to_dict") and all(isinstance(name, str) for name in value.index):
         return plain_values(value.to_dict())
     if hasattr(value, "tolist"):

@@ -79,7 +79,7 @@ def reason_against_scenes(system: System) -> str:
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     searched = {*system.characteristics.scenario.names} - WEATHER_PARAMETERS.keys()
-    if searched and any(map(_has_own_traffic, system.points)):
+    if searched and any(_has_own_traffic(point) for point in system.points):
         names = ", ".join(sorted(searched))
         return f"each encounter has traffic of its own, by {names}"
     return system.scenes.reason_against_scenes(system.points)
@@ -116,7 +116,7 @@ def drive_all(
     if system.mover.takes_long:
         return simulate_each(system, np.tile(settings, (system.repeats, 1)))
     vehicles, encounters = system.split(settings)
-    on_road = system.at_encounters(encounters)
+    road_system = system.at_encounters(encounters)
     # Compilation may take longer than a simulation: it must not count in the time limit.
     system.vehicle.compile()
     with system.user_code(), end_if_longer(system.time_limit):
@@ -124,17 +124,17 @@ def drive_all(
         # tracks all points are simulated at once.
         if reason_against_scenes(system):
             with open_points_world(system, encounters) as (sumo_world, observer):
-                return drive(on_road, vehicles, sumo_world, observer, listen)
+                return drive(road_system, vehicles, sumo_world, observer, listen)
         traffic = traffic_of(system, encounters, 0.0)
         if traffic is not None:
             lane = LaneWorld(traffic, traffic.step)
             vehicles = np.tile(vehicles, (len(system.points), 1))
-            return drive(on_road, vehicles, lane, traffic, listen)
-        scenario = on_road.points[0].scenario
+            return drive(road_system, vehicles, lane, traffic, listen)
+        scenario = road_system.points[0].scenario
         assert isinstance(scenario, WorldScenario)
         world = _recorded_world(system, encounters, scenario)
         observer = SceneObserver(scenario, world)
-        return drive(on_road, vehicles, world, observer, listen)
+        return drive(road_system, vehicles, world, observer, listen)
 
 
 def _recorded_world(
@@ -177,7 +177,7 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
     points = system.at_encounters(encounters[distinct]).points
     n_encounters = len(distinct)
     starts = n_encounters * np.arange(len(points))
-    group = (starts[:, None] + np.ravel(group)).ravel()
+    group = (starts[:, np.newaxis] + np.ravel(group)).ravel()
     step = system.scenes.step_of(points[0].scenario)
     last_sample = max(float(np.max(last_sample_of(point, step))) for point in points)
     n_samples = round(last_sample + longer / step) + 1
@@ -202,8 +202,10 @@ def open_points_world(
 
     scenarios = [point.scenario]
     if n_searched:
-        searched = map(system.characteristics.scenario.named, encounters)
-        scenarios = [encounter(point, values).scenario for values in searched]
+        name_values = system.characteristics.scenario.named
+        scenarios = [
+            encounter(point, name_values(values)).scenario for values in encounters
+        ]
     networks = networks_for(scenarios)
 
     # SUMO cannot move bodies along tracks: a TrafficWorld puts them at their places.

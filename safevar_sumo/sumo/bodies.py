@@ -64,15 +64,15 @@ class Body(NamedTuple):
         speed: FloatArray,
     ) -> Body:
         """M bodies, the middles of whose fronts are at `front`, shape (M, 2)."""
-        middle = front - along * (np.asarray(length)[..., None] / 2)
+        middle = front - along * (np.asarray(length)[..., np.newaxis] / 2)
         return cls(middle, along, length, width, speed)
 
     @property
     def velocity(self) -> FloatArray:
         """Velocities of M bodies in columns, shape (M, 2) [m/s]."""
         along, across = _axes_of(self)
-        drift = self.drift[..., None]
-        return np.asarray(along * self.speed[:, None] + across * drift)
+        drift = self.drift[..., np.newaxis]
+        return np.asarray(along * self.speed[:, np.newaxis] + across * drift)
 
 
 class BodyPairs(NamedTuple):

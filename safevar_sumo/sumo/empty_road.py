@@ -88,11 +88,11 @@ def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
         return ""
     point, problem = next(iter(problems.items()))
     count = sum(fault.reason is problem.reason for fault in problems.values())
-    where = ""
+    place = ""
     if n_points > 1:
-        where = f" at {count} of {n_points} points, such as {point}"
+        place = f" at {count} of {n_points} points, such as {point}"
     return (
-        f"On a first drive, with nobody in sight, the original vehicle {problem.words}{where}. So"
+        f"On a first drive, with nobody in sight, the original vehicle {problem.words}{place}. So"
         " its drives with somebody in sight do not show how it reacts to them: no verdict."
     )
 

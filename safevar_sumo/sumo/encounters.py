@@ -119,8 +119,8 @@ def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
     if point.scenario.has_phase:
         phase = values.pop(PHASE, phase)
     names = WEATHER_PARAMETERS.keys() & values.keys()
-    of_weather = {name: values.pop(name) for name in names}
-    weather = replace_fields(point.weather, **of_weather)
+    weather_values = {name: values.pop(name) for name in names}
+    weather = replace_fields(point.weather, **weather_values)
     scenario = point.scenario
     if values:
         scenario = scenario.at(values)
@@ -163,9 +163,11 @@ def scenes_of_encounters(
         frame = Frame.of(recording.lane(recording.first_lanes[VUT]))
         # The index of the recorded sample at which the pedestrian is nearest to the middle of the
         # lane. Positions are NaN in samples in which the pedestrian is not on the road.
-        at_lane = np.nanargmin(np.abs(frame.left(track.motion[:, :2])))
+        nearest_sample = np.nanargmin(np.abs(frame.left(track.motion[:, :2])))
         # `along` takes an array of positions: x and y of this sample alone have shape (1, 2).
-        place = frame.point(frame.along(track.motion[[at_lane], :2]), layout.left)
+        place = frame.point(
+            frame.along(track.motion[[nearest_sample], :2]), layout.left
+        )
         sign = np.where(layout.backwards, -1.0, 1.0)
         _, _, dir_x, dir_y, _ = track.motion[0]
         motion = *place, sign * dir_x, sign * dir_y, layout.speed
@@ -199,7 +201,7 @@ def where_met(system: System, setting: FloatArray) -> System:
     InputError
         If the setting meets no point.
     """
-    settings = setting[None]
+    settings = setting[np.newaxis]
     points = tuple(
         point
         for point in system.points
@@ -235,12 +237,15 @@ def in_place_of_unmet(
     members = system.characteristics
     originals = _originals(point.ranges or {})
     original = np.array([originals.get(item.name, item.original) for item in members])
-    return np.where(is_met[:, None] | members.of_vehicle, settings, original)
+    return np.where(is_met[:, np.newaxis] | members.of_vehicle, settings, original)
 
 
-def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
-    """The index of each setting's worst point in `system.points`, shape (N,). `at_points` has the
-    evaluations of the N settings at each point, in the order of the points.
+def worst_points(
+    system: System, evaluations_by_point: Sequence[Evaluations]
+) -> IntArray:
+    """The index of each setting's worst point in `system.points`, shape (N,).
+    `evaluations_by_point` has the evaluations of the N settings at each point, in the order of the
+    points.
 
     - By the aggregate "worst" of the matrix, the point with the least safety degree is the worst.
     - By another aggregate, such as "drac >", the worst value of this metric decides for a setting
@@ -252,7 +257,7 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
     """
     # With points sorted by name, ties do not depend on the order of tests in the study's file.
     order = np.argsort([point.name for point in system.points])
-    evaluations = Evaluations.concatenate([at_points[k] for k in order])
+    evaluations = Evaluations.concatenate([evaluations_by_point[k] for k in order])
     shape = (len(order), -1)
     safety_degrees = evaluations.f_safe.reshape(shape)
     safety_degrees = np.where(np.isnan(safety_degrees), np.inf, safety_degrees)

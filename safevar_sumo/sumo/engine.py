@@ -91,12 +91,12 @@ def _numbers_with_points() -> Iterator[None]:
     """Within the block, this process reads and writes numbers as in the C locale. With a locale
     that user code has set, SUMO may expect a comma in place of the point.
     """
-    of_user = locale.setlocale(locale.LC_NUMERIC)
+    user_locale = locale.setlocale(locale.LC_NUMERIC)
     locale.setlocale(locale.LC_NUMERIC, "C")
     try:
         yield
     finally:
-        locale.setlocale(locale.LC_NUMERIC, of_user)
+        locale.setlocale(locale.LC_NUMERIC, user_locale)
 
 
 @contextmanager
@@ -177,10 +177,10 @@ def traci_api() -> Api:
 def sumo_options(files: CopiedNetwork, step: float | None = None) -> list[str]:
     """The options with which SUMO simulates copies of a network; see `open_world`."""
     # The command line overrules the user's options: what the simulation needs stands there.
-    stated = options_in(files.options)
+    stated_options = options_in(files.options)
     if step is None:
-        step = step_of(stated)
-    options = own_options(stated) | {
+        step = step_of(stated_options)
+    options = own_options(stated_options) | {
         "step-length": repr(step),
         "configuration-file": str(files.options),
         "net-file": str(files.network),

@@ -183,10 +183,12 @@ def _beside(
 
 def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
     """Evaluate settings, shape (N, n), at their worst points."""
-    at_points = evaluate_points(system, settings)
-    numbers = worst_points(system, at_points)
+    evaluations_by_point = evaluate_points(system, settings)
+    numbers = worst_points(system, evaluations_by_point)
     rows = numbers * len(settings) + np.arange(len(settings))
-    return replace(Evaluations.concatenate(at_points).take(rows), worst_points=numbers)
+    return replace(
+        Evaluations.concatenate(evaluations_by_point).take(rows), worst_points=numbers
+    )
 
 
 def evaluate_points(system: System, settings: FloatArray) -> list[Evaluations]:
@@ -219,8 +221,8 @@ def most_in_memory(system: System) -> int:
     each vehicle, make it smaller.
     """
     longest = max(float(np.max(scenario.duration)) for scenario in system.scenarios)
-    in_memory = round(MAX_VEHICLES * min(LONG_RUN / longest, 1.0))
-    return min(in_memory, system.ads.max_vehicles or in_memory)
+    memory_limit = round(MAX_VEHICLES * min(LONG_RUN / longest, 1.0))
+    return min(memory_limit, system.ads.max_vehicles or memory_limit)
 
 
 def most_at_once(system: System) -> int:
@@ -231,7 +233,7 @@ def most_at_once(system: System) -> int:
         return 1
     if not reason_against_scenes(system):
         return most_in_memory(system)
-    lanes = max(map(number_of_lanes, map(open_network, system.networks)))
+    lanes = max(number_of_lanes(open_network(name)) for name in system.networks)
     return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, most_in_memory(system))
 
 
@@ -284,8 +286,8 @@ def worst_point(system: System, setting: FloatArray) -> Point:
     """The worst point of a setting, shape (n,); see `worst_points`."""
     if not system.matrix:
         return system.points[0]
-    at_points = evaluate_points(system, setting[np.newaxis])
-    return system.points[int(worst_points(system, at_points)[0])]
+    evaluations_by_point = evaluate_points(system, setting[np.newaxis])
+    return system.points[int(worst_points(system, evaluations_by_point)[0])]
 
 
 def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:

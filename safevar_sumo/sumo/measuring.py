@@ -73,7 +73,8 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
 
     for name in study.metrics.also:
         _add_metric(name, study, named, metrics)
-    if (bound := own_criterion(study).bound) is not None:
+    bound = own_criterion(study).bound
+    if bound is not None:
         measures = OPTIONAL_METRICS | named.computed
         problem = f"{study.unsafe.criterion!r}: there is no metric {bound.measure!r}"
         check_name("", f"{CRITERION_KEY} = {problem}", bound.measure, measures)
@@ -83,11 +84,11 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     if IMPACT_EXCESS.name in named.computed:
         # Sentences about the impact excess state the impact speed, too.
         named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)
-    of_runs = tuple(
+    run_metrics = tuple(
         measure.facts for measure in named.computed.values() if measure.of == "runs"
     )
     return Measuring(
-        named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives))
+        named.computed, Scoring(metrics=run_metrics, objectives=tuple(objectives))
     )
 
 

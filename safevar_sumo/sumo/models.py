@@ -90,11 +90,17 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
         controller = member.target
         parameters = lookup.with_paths(member, table.parameters, "ads.parameters")
         is_class = inspect.isclass(controller)
-        step: Any = getattr(controller, "step", None) if is_class else controller
+        step: Any = controller
+        arguments = ["traci", "vehicle_id"]
+        keywords = parameters
+        if is_class:
+            # The parameters belong to the class, and its method `step` also takes the instance.
+            step = getattr(controller, "step", None)
+            arguments = ["self", *arguments]
+            keywords = {}
         try:
-            inspect.signature(step).bind(
-                *[None] * (2 + is_class), **({} if is_class else parameters)
-            )
+            # The names stand for values: only the signature is compared.
+            inspect.signature(step).bind(*arguments, **keywords)
         except (TypeError, ValueError) as error:
             raise InputError(
                 "",
@@ -135,10 +141,13 @@ def matrix_points(study: Study, lookup: Lookup) -> tuple[Point, ...]:
 
 
 def _points_of(
-    test: MatrixTest, study: Study, of_tests: Sequence[Constraint], lookup: Lookup
+    test: MatrixTest,
+    study: Study,
+    test_constraints: Sequence[Constraint],
+    lookup: Lookup,
 ) -> Iterator[Point]:
-    """The points of a test of the study's matrix. `of_tests` are the constraints that hold only in
-    tests; all other constraints hold for every setting.
+    """The points of a test of the study's matrix. `test_constraints` are the constraints that hold
+    only in tests; all other constraints hold for every setting.
     """
     model = test.model or study.scenario.model
     shared = study.scenario.parameters if model == study.scenario.model else {}
@@ -146,7 +155,7 @@ def _points_of(
     ranges = study.ranges_of(test)
     constraints = tuple(
         constraint
-        for constraint in of_tests
+        for constraint in test_constraints
         if test.name in (constraint.tests or [test.name])
     )
     for number, alone in enumerate(study.points_of(test)):
@@ -186,10 +195,12 @@ def _check_listed(values: Mapping[str, Any], constraints: Sequence[Constraint]) 
     }
     for constraint in constraints:
         if not constraint.allows(numbers):
-            where = ", ".join(f"{name} = {numbers[name]:g}" for name in constraint.sum)
+            values_in_words = ", ".join(
+                f"{name} = {numbers[name]:g}" for name in constraint.sum
+            )
             raise InputError(
                 "",
-                f"{where} violates the constraint of {constraint.quantity}",
+                f"{values_in_words} violates the constraint of {constraint.quantity}",
                 "encounters that the constraints allow",
             )
 
@@ -201,13 +212,14 @@ def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
     A folder with XML files has priority, because a results directory beside the study may have the
     same name as the network.
     """
-    paths = [
-        path for folder in folders if is_network(path := Path(folder, scenario.network))
-    ]
+    candidates = [Path(folder, scenario.network) for folder in folders]
+    paths = [path for path in candidates if is_network(path)]
     if not (paths and scenario.mover.has("roads")) or is_shipped(scenario.network):
         return scenario
-    with_sources = [path for path in paths if path.is_file() or any(path.glob("*.xml"))]
-    network = str((with_sources or paths)[0])
+    paths_with_sources = [
+        path for path in paths if path.is_file() or any(path.glob("*.xml"))
+    ]
+    network = str((paths_with_sources or paths)[0])
     if isinstance(scenario, msgspec.Struct):
         return msgspec.structs.replace(scenario, network=network)
     vars(scenario)["network"] = network

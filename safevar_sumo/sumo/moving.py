@@ -113,7 +113,8 @@ class Moving(NamedTuple):
         # With this sign `lateral` rises while a body crosses, from whichever side it comes.
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
         moves = (is_there & (track.speed > 0)).any(axis=0)
-        level = np.where(is_in_path.any(axis=0), IN_PATH, BESIDE_LEVEL * moves)
+        level_beside = np.where(moves, BESIDE_LEVEL, 0)
+        level = np.where(is_in_path.any(axis=0), IN_PATH, level_beside)
         if track.kind == SCREEN:
             level = np.full_like(level, -1)
         return cls(
@@ -201,9 +202,9 @@ def tracks_of(
     ]
     for tracks in tracks_of_scenarios:
         check_shapes(tracks, len(times), n_encounters, step)
-    of_bodies = zip_longest(*tracks_of_scenarios, fillvalue=FAR_BODY)
+    tracks_of_bodies = zip_longest(*tracks_of_scenarios, fillvalue=FAR_BODY)
     width = n_encounters if len(points) > 1 else 1
-    joined = [_joined(tracks, width) for tracks in of_bodies]
+    joined = [_joined(tracks, width) for tracks in tracks_of_bodies]
     for track in joined:
         check_motion(track, times, step)
     check_start(joined, vehicle)
@@ -214,13 +215,16 @@ def _joined(tracks: Sequence[Track], width: int) -> Track:
     """Join the tracks of a body in K scenarios into one track, whose columns have at least `width`
     values for each scenario.
     """
-    columns = []
-    for values in zip(*(track[2:] for track in tracks), strict=True):
-        parts = [np.atleast_2d(np.asarray(value, float)) for value in values]
+    quantities = [track.quantities for track in tracks]
+    columns = {}
+    for name in FAR_BODY.quantities:
+        parts = [
+            np.atleast_2d(np.asarray(values[name], float)) for values in quantities
+        ]
         length = max(len(part) for part in parts)
         widened = [
             np.broadcast_to(part, (length, max(width, part.shape[1]))) for part in parts
         ]
-        columns.append(slim(np.concatenate(widened, axis=1)))
+        columns[name] = slim(np.concatenate(widened, axis=1))
     body = next(track for track in tracks if track is not FAR_BODY)
-    return Track(body.name, body.kind, *columns)
+    return Track(body.name, body.kind, **columns)

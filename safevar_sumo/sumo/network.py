@@ -13,11 +13,10 @@ import hashlib
 import re
 import subprocess
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, lru_cache
 from importlib.metadata import version
-from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,10 +53,15 @@ network and its traffic.
 """
 MESSAGE_LENGTH = 500
 """Number of characters of a program's message that are used."""
-Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
-"""The same as `XmlChanges`, as tuples, which can be hashed: paths of elements, and their new
-attributes, or None for an element that is removed.
-"""
+
+
+class ElementChange(NamedTuple):
+    """A change of the elements at a path of an XML file: pairs of an attribute and its new value,
+    or None if the elements are removed. It is an item of `XmlChanges`, but can be hashed.
+    """
+
+    path: str
+    attributes: tuple[tuple[str, str], ...] | None
 
 
 class NetworkFiles(NamedTuple):
@@ -73,8 +77,8 @@ class NetworkFiles(NamedTuple):
     folder: Path
     roads_file: str
     digests: tuple[tuple[str, str], ...]
-    lane_changes: Changes = ()
-    traffic_changes: Changes = ()
+    lane_changes: tuple[ElementChange, ...] = ()
+    traffic_changes: tuple[ElementChange, ...] = ()
 
     def path(self, name: str) -> Path:
         return self.folder / name
@@ -153,9 +157,9 @@ def _roads_in(folder: Path) -> str:
     """
     names = _names_in(folder, RECIPE_ENDING) or _names_in(folder, NETWORK_ENDING)
     if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
-        stated = options_in(folder / OPTIONS_FILE).get("net-file")
-        if stated in names:
-            names = [stated]
+        network_option = options_in(folder / OPTIONS_FILE).get("net-file")
+        if network_option in names:
+            names = [network_option]
     if len(names) != 1:
         raise InputError(
             folder,
@@ -201,13 +205,10 @@ def copied_network(network: NetworkFiles, n: int) -> CopiedNetwork:
     EnvironmentFault
         If netconvert fails for another reason, or the cache cannot be written.
     """
-    # Few sizes of networks serve all batches: 1, 2, 5, 10, 20, 50, ...
-    size = next(
-        size
-        for power in count()
-        for factor in (1, 2, 5)
-        if (size := factor * 10**power) >= n
-    )
+    # Few sizes of networks serve all batches: 1, 2, 5, 10, 20, 50, ... The power of ten has as many
+    # digits as n.
+    power = 10 ** (len(str(n)) - 1)
+    size = min(factor * power for factor in (1, 2, 5, 10) if factor * power >= n)
     traffic_file = network.path(TRAFFIC_FILE)
 
     def copy_roads(into: Path) -> None:
@@ -412,12 +413,13 @@ def networks_for(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
     return networks
 
 
-def _frozen(changes: XmlChanges) -> Changes:
-    """The changes as tuples, which can be hashed; see `Changes`."""
-    return tuple(
-        (path, None if attributes is None else tuple(attributes.items()))
-        for path, attributes in changes.items()
-    )
+def _frozen(changes: XmlChanges) -> tuple[ElementChange, ...]:
+    """The changes as records, which can be hashed."""
+    records = []
+    for path, attributes in changes.items():
+        pairs = None if attributes is None else tuple(attributes.items())
+        records.append(ElementChange(path, pairs))
+    return tuple(records)
 
 
 class _BuiltRoads:
@@ -442,7 +444,7 @@ def _lane_shapes(network: NetworkFiles) -> dict[str, str]:
     }
 
 
-def _changed(file: Path, changes: Changes) -> ElementTree.Element:
+def _changed(file: Path, changes: Iterable[ElementChange]) -> ElementTree.Element:
     """The root of an XML file with these changes. A path without an element is an error."""
     root = parse_xml(file)
     for path, attributes in changes:

@@ -177,16 +177,16 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
         )
 
     options_file = network.path(OPTIONS_FILE)
-    stated = DEFAULT_OPTIONS | options_in(options_file)
-    if "step-length" not in stated:
+    options = DEFAULT_OPTIONS | options_in(options_file)
+    if "step-length" not in options:
         remarks.append(
             f"{options_file} has no step-length: {STEP_LENGTH:g} s unless the study has"
             " `step_length` (SUMO: 1 s)"
         )
     overruled = [
-        f"{option} = {stated[option]} ({value or 'none'} counts)"
-        for option, value in own_options(stated).items()
-        if option in stated and not _is_same(stated[option], value)
+        f"{option} = {options[option]} ({value or 'none'} counts)"
+        for option, value in own_options(options).items()
+        if option in options and not _is_same(options[option], value)
     ]
     if overruled:
         reason = (
@@ -236,12 +236,12 @@ def _check_files(network: NetworkFiles) -> None:
         or not is_legal_step
         or options["route-files"] != TRAFFIC_FILE
     ):
-        stated = ", ".join(
+        option_texts = ", ".join(
             f"{name} = {options[name]!r}"
             for name in ("remote-port", "step-length", "route-files")
             if name in options
         )
-        raise InputError(network.path(OPTIONS_FILE), stated, LEGAL_OPTIONS)
+        raise InputError(network.path(OPTIONS_FILE), option_texts, LEGAL_OPTIONS)
 
     # A setting changes the type of the vehicle under test: no other vehicle may have this type.
     file = network.path(TRAFFIC_FILE)

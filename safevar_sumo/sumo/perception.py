@@ -32,7 +32,7 @@ OCCLUDED = {
     "obstacle": 0.0,
 }
 """Observed values of an obstacle that is occluded: it is at rest, infinitely far away [m, m/s]."""
-_UNSEEN = np.array(list(OCCLUDED.values()))[:, None]
+_UNSEEN = np.array(list(OCCLUDED.values()))[:, np.newaxis]
 
 
 class Observer(Protocol):

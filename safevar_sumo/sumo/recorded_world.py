@@ -121,7 +121,10 @@ class RecordedWorld:
 
         # A fast vehicle may pass several lanes in a step.
         last_lane = len(self._scene.way.end) - 1
-        while np.count_nonzero(is_past := self._lane_position > self._lanes.end):
+        while True:
+            is_past = self._lane_position > self._lanes.end
+            if not is_past.any():
+                break
             if (self._lane_number[is_past] == last_lane).any():
                 raise SimulationError(
                     "SUMO failed: a vehicle under test drives beyond the end of its route"
@@ -228,8 +231,10 @@ class RecordedWorld:
         east, north = self._scene.along
         along = np.abs(dx * east + dy * north)
         across = np.abs(dy * east - dx * north)
-        covered = np.maximum(self._before.speeds, self._now.speeds) * self.step_length
-        is_near_along = along < self._reach[0] + covered[:, np.newaxis]
+        largest_way = (
+            np.maximum(self._before.speeds, self._now.speeds) * self.step_length
+        )
+        is_near_along = along < self._reach[0] + largest_way[:, np.newaxis]
         return np.asarray(is_near_along & (across < self._reach[1]))
 
     def _overlaps(

@@ -85,7 +85,7 @@ class LaneSequence(NamedTuple):
         lanes, shape (N,) [m].
         """
         share = lane_position * self.stretch / self.shape_length
-        return self.origin + self.vector * share[:, None]
+        return self.origin + self.vector * share[:, np.newaxis]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,14 +288,17 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
             links = api.lane.getLinks(lanes[-1])
         lanes.append(next_lane)
 
-    shapes = list(map(api.lane.getShape, lanes))
-    if api.vehicle.getLateralLanePosition(vut) or {*map(len, shapes)} != {2}:
+    shapes = [api.lane.getShape(lane) for lane in lanes]
+    # A straight lane has a shape of two points.
+    if api.vehicle.getLateralLanePosition(vut) or any(
+        len(shape) != 2 for shape in shapes
+    ):
         return None
     starts, ends = np.array(shapes, float).transpose(1, 0, 2)
     vector = ends - starts
     lengths = np.array([api.lane.getLength(lane) for lane in lanes])
     shape_length = np.sqrt((vector * vector).sum(axis=1))
-    direction = vector / shape_length[:, None]
+    direction = vector / shape_length[:, np.newaxis]
     largest_turn = np.abs(direction - direction[0]).max()
     largest_gap = np.abs(starts[1:] - ends[:-1]).max(initial=0.0)
     if largest_turn > STRAIGHTNESS or largest_gap > STRAIGHTNESS:

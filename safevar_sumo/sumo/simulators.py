@@ -261,10 +261,10 @@ def _check_names(scenario: Simulator, result: StatedRun, system: System) -> None
                 f"names of metrics: {', '.join(sorted(names))}",
             )
     # The share of unsafe runs follows from all runs of a setting.
-    known = {UNSAFE_SHARE.name, *result}
+    known_names = {UNSAFE_SHARE.name, *result}
     scoring = system.measuring.scoring
     for objective in scoring.objectives:
-        if objective in scoring.metrics and objective.name not in known:
+        if objective in scoring.metrics and objective.name not in known_names:
             raise code.wrong(
                 "simulate",
                 f"a result without a trace and without {objective.name}",
@@ -307,9 +307,9 @@ def _runs_of(
         np.isnan(number(IMPACT_SPEED)), -number(SAFETY_DEGREE), number(IMPACT_SPEED)
     )
     closing_speed = np.maximum(impact - struck, LEAST_COLLISION_SPEED)
-    stated = {name: number(name, rigs) for name in system.measuring.measures}
-    stated["impact_speed"] = np.where(collided, closing_speed, np.nan)
-    stated["impact_excess"] = np.where(
+    stated_values = {name: number(name, rigs) for name in system.measuring.measures}
+    stated_values["impact_speed"] = np.where(collided, closing_speed, np.nan)
+    stated_values["impact_excess"] = np.where(
         collided, closing_speed - allowed_impact_speed, number("impact_excess", rigs)
     )
 
@@ -325,7 +325,7 @@ def _runs_of(
             lateral=nothing,
             lateral_speed=nothing,
             gear=nothing,
-            active=samples[:, None] < lengths,
+            active=samples[:, np.newaxis] < lengths,
             **columns,
         ),
         encounter=Encounter(
@@ -339,7 +339,7 @@ def _runs_of(
             name: np.array([name not in trace for trace in traces])
             for name in QUANTITIES
         },
-        stated=stated,
+        stated=stated_values,
     )
 
 

@@ -186,8 +186,8 @@ class System:
         """Split N settings, shape (N, n), into the values of the vehicles, shape (N, k), and the
         values of their encounters: the n - k scenario parameters that the study searches.
         """
-        of_vehicle = self.characteristics.of_vehicle
-        return settings[:, of_vehicle], settings[:, ~of_vehicle]
+        is_of_vehicle = self.characteristics.of_vehicle
+        return settings[:, is_of_vehicle], settings[:, ~is_of_vehicle]
 
     def at_encounters(self, encounters: FloatArray) -> System:
         """The system in N encounters, shape (N, n - k): its points have arrays as the parameters
@@ -238,9 +238,13 @@ def _original_points(study: Study, lookup: Lookup, single: Point) -> tuple[Point
 
     Ranges that the study states are checked even if the study uses listed encounters.
     """
-    in_ranges = with_ranges(study) if study.states_ranges else study
-    points = matrix_points(in_ranges, lookup) or (single,) if in_ranges.ranges else ()
-    check_domains(in_ranges, points)
+    study_in_ranges = with_ranges(study) if study.states_ranges else study
+    points = (
+        matrix_points(study_in_ranges, lookup) or (single,)
+        if study_in_ranges.ranges
+        else ()
+    )
+    check_domains(study_in_ranges, points)
     if not study.ranges:
         return ()
     for name in study.scenario.over:

@@ -50,7 +50,7 @@ def check_shapes(
             )
 
     for track in tracks:
-        for name, value in zip(Track._fields[2:], track[2:], strict=True):
+        for name, value in track.quantities.items():
             # A number or a single row has the same value at all samples.
             shape = (1, *np.shape(value))[-2:]
             if (
@@ -89,7 +89,7 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
         With the actor, the time [s] and what is expected.
     """
     refuse = partial(_refuse, track, step)
-    for name, column in zip(Track._fields[2:], track[2:], strict=True):
+    for name, column in track.quantities.items():
         refuse(
             ~np.isfinite(column),
             column,
@@ -128,12 +128,12 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
     across = _way_and_driven(track, track.y, speed * track.left, times)
     longer_along = np.maximum(*np.abs(along))
     longer_way = np.hypot(longer_along, np.maximum(*np.abs(across)))
-    for (way, driven), axis, longer, least in (
+    for (way, driven), axis, longer, least_difference in (
         (along, "x", longer_along, LEAST_MISPLACEMENT),
         (across, "y", longer_way, WIDE_LANE),
     ):
         refuse(
-            np.abs(way - driven) > np.maximum(least, longer / 3),
+            np.abs(way - driven) > np.maximum(least_difference, longer / 3),
             way - driven,
             f"is {{:.3g}} m in {axis} from where its speed takes it",
             f"a place whose {axis} changes by v{axis}, the speed in {axis}, times the time",
@@ -208,7 +208,7 @@ def check_start(tracks: Sequence[Track], vehicle: Body) -> None:
 def _first(track: Track) -> Body:
     """A body at the first sample of M encounters, in columns."""
     length, width, x, y, cosine, sine, speed = np.broadcast_arrays(
-        *(column[0] for column in track[2:])
+        *(column[0] for column in track.quantities.values())
     )
     along = np.stack([cosine, sine], axis=1)
     return Body(np.stack([x, y], axis=1), along, length, width, speed)

@@ -98,7 +98,7 @@ class Traffic:
 
     def _place(self, n_samples: int) -> None:
         """Compute the bodies' positions at this number of samples."""
-        times = np.arange(n_samples, dtype=float)[:, None] * self.step
+        times = np.arange(n_samples, dtype=float)[:, np.newaxis] * self.step
         vehicle = self._vehicle_body(np.zeros(1), np.zeros(1))
         self.tracks = tracks_of(
             self._points, times, self._n_encounters, self.step, vehicle
@@ -221,10 +221,10 @@ class Traffic:
         for start, change, size in axes:
             half = self._at_sample(size) / 2 + TIE
             # A line along the body divides by 0: infinite shares give the right answer.
-            to_rear = (-half - start) / change
-            to_front = (half - start) / change
-            enter = np.maximum(enter, np.minimum(to_rear, to_front))
-            leave = np.minimum(leave, np.maximum(to_rear, to_front))
+            rear_share = (-half - start) / change
+            front_share = (half - start) / change
+            enter = np.maximum(enter, np.minimum(rear_share, front_share))
+            leave = np.minimum(leave, np.maximum(rear_share, front_share))
         blocks = (enter < leave) & (leave > 0) & (enter < 1)
         return np.asarray(blocks & self._at_sample(body.is_there))
 
@@ -253,10 +253,10 @@ class Traffic:
             is_counted = self._at_sample(self._is_counted[view.body])
             rank = (
                 view.gap
-                + OFF_THE_WAY * ~self._is_in_way(view)
-                + FAR_AWAY * ~view.visible
-                + PASSED * view.is_passed
-                + NOT_MET * ~is_counted
+                + np.where(self._is_in_way(view), 0.0, OFF_THE_WAY)
+                + np.where(view.visible, 0.0, FAR_AWAY)
+                + np.where(view.is_passed, PASSED, 0.0)
+                + np.where(is_counted, 0.0, NOT_MET)
             )
             ranks.append(np.where(self._struck == view.body, -np.inf, rank))
 
@@ -341,7 +341,7 @@ class Traffic:
         # If a column has one value for all vehicles, "clip" takes it for each of them.
         length, width, x, y, cosine, sine, speed, drift = (
             self._at_sample(column).take(vehicles, mode="clip")
-            for column in (*body.track[2:], body.vy)
+            for column in (*body.track.quantities.values(), body.vy)
         )
         if not body.faces_along:
             drift = np.zeros_like(drift)
@@ -398,7 +398,10 @@ class Traffic:
         divisor = np.maximum(separation, LEAST_DISTANCE_DIVISOR)
         rate = (closing_along - parting_across) / divisor
         if body.is_rotated:
-            columns = (self._at_samples(column, samples) for column in body.track[2:])
+            columns = (
+                self._at_samples(column, samples)
+                for column in body.track.quantities.values()
+            )
             track = Track(*body.track[:2], *columns)
             middle = front - self.length / 2
             separation = distance_between(track, middle, self.length, self.width)

@@ -54,13 +54,13 @@ def drive_again(
     n = len(runs)
     values = {name: nans(trace.speed.shape) for name in (*COMPARED, "collision")}
     vehicles, encounters = system.split(settings)
-    on_road = system.at_encounters(encounters)
-    point = on_road.points[0]
+    road_system = system.at_encounters(encounters)
+    point = road_system.points[0]
     with (
         system.user_code(),
         open_points_world(system, encounters, start) as (world, observer),
     ):
-        motion = enter(on_road, vehicles, world).motion
+        motion = enter(road_system, vehicles, world).motion
         is_open = np.ones(n, bool)
         frame = world.frame
         contacts = FirstContacts(n, np.full(n, point.scenario.is_hit_in_front))
@@ -99,11 +99,13 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
     # One point of each test is a candidate for the second points: a digest of the settings chooses
     # it. Settings take the candidates in turn; instead of its worst point a setting takes the next.
     points = system.points
-    of_tests = dict[Any, list[int]]()
+    numbers_by_test = dict[Any, list[int]]()
     for number, point in enumerate(points):
-        of_tests.setdefault(point.parameters.get("test"), []).append(number)
+        numbers_by_test.setdefault(point.parameters.get("test"), []).append(number)
     digest = zlib.crc32(settings.tobytes())
-    candidates = [numbers[digest % len(numbers)] for numbers in of_tests.values()]
+    candidates = [
+        numbers[digest % len(numbers)] for numbers in numbers_by_test.values()
+    ]
     second_points = np.resize(candidates, len(settings))
     second_points = np.where(
         second_points == worst, (worst + 1) % len(points), second_points
@@ -112,13 +114,13 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
     remark = ""
     size = most_at_once(system)
     for number in np.union1d(worst, second_points):
-        at_point = system.at(points[number])
+        point_system = system.at(points[number])
         is_here = (worst == number) | (second_points == number)
-        of_point = settings[is_here & met_at(points[number], system, settings)]
-        for start in range(0, len(of_point), size):
-            batch = of_point[start : start + size]
+        point_settings = settings[is_here & met_at(points[number], system, settings)]
+        for start in range(0, len(point_settings), size):
+            batch = point_settings[start : start + size]
             try:
-                _verify_point(at_point, batch, drive_all(at_point, batch))
+                _verify_point(point_system, batch, drive_all(point_system, batch))
             except SimulationError as error:
                 remark = f"some of {len(batch)} settings could not be verified in SUMO: {error}"
     return remark
@@ -139,7 +141,7 @@ def _compare(system: System, settings: FloatArray, runs: SimulationRuns) -> None
     """Compare the quantities of N runs in recorded scenes, shape (T, N), with the same quantities
     in SUMO. Raises an InputError about the first difference.
     """
-    in_sumo = drive_again(system, settings, runs)
+    sumo_values = drive_again(system, settings, runs)
     trace = runs.trace
     collision = nans(trace.speed.shape)
     collision[trace.last_active, np.arange(len(settings))] = runs.collision_speed
@@ -150,7 +152,7 @@ def _compare(system: System, settings: FloatArray, runs: SimulationRuns) -> None
     recorded["collision"] = collision
     for name, values in recorded.items():
         differs = trace.active & ~np.isclose(
-            in_sumo[name], values, rtol=0, atol=RESULT_ROUNDING, equal_nan=True
+            sumo_values[name], values, rtol=0, atol=RESULT_ROUNDING, equal_nan=True
         )
         # `collision_speed` is NaN in an invalid test, also if the vehicle has hit somebody.
         if name == "collision":
@@ -162,7 +164,7 @@ def _compare(system: System, settings: FloatArray, runs: SimulationRuns) -> None
             raise InputError(
                 system.source,
                 f"{name.replace('_', ' ')} at {trace.time[sample]:g} s is {values[sample, row]:.9g}"
-                f" in the recorded scene and {in_sumo[name][sample, row]:.9g} in SUMO, with"
+                f" in the recorded scene and {sumo_values[name][sample, row]:.9g} in SUMO, with"
                 f" {setting}",
                 "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or"
                 " `engine=sumo`",

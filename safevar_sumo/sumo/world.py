@@ -194,7 +194,8 @@ class SumoWorld:
                     (collision.victim, collision.victimSpeed, collision.collider)
                 )
             for id_, speed, other_id in pairs:
-                if (copy := self._copy_of.get(id_)) is not None and is_open[copy]:
+                copy = self._copy_of.get(id_)
+                if copy is not None and is_open[copy]:
                     speeds[copy] = speed
                     self._struck_ids[copy] = other_id
         return speeds
@@ -227,8 +228,10 @@ class SumoWorld:
             along = direction_of(domain.getAngle(id_))
             size = domain.getLength(id_), domain.getWidth(id_)
             rows.append((*place, *along, *size, domain.getSpeed(id_)))
-        front, along, rest = np.split(np.reshape(rows, (-1, 7)), (2, 4), axis=1)
-        length, width, speed = rest.T
+        front, along, sizes_and_speed = np.split(
+            np.reshape(rows, (-1, 7)), (2, 4), axis=1
+        )
+        length, width, speed = sizes_and_speed.T
         return Body.behind(front, along, length, width, speed)
 
     def speeds(self) -> FloatArray:

@@ -296,7 +296,7 @@ class CharacteristicSet:
     @property
     def original_settings(self) -> FloatArray:
         """The original setting as an array of one setting, shape (1, n)."""
-        return self.original[None]
+        return self.original[np.newaxis]
 
     @cached_property
     def lower(self) -> FloatArray:

@@ -107,27 +107,28 @@ class FeasibleRegion:
             The error names a constraint that the first infeasible setting violates, and the values
             of this setting.
         """
-        # The error is about the first infeasible setting, if there is any.
-        for setting in settings[~self.feasible(settings)][:1]:
-            named = self.characteristics.named(setting)
-            # The sum of all violations is above `BOUND_SLACK`, so that one is above this share.
-            bound = next(
-                bound
-                for bound in self.bounds
-                if bound.excess(named) > BOUND_SLACK / len(self.bounds)
-            )
-            values = [
-                f"{member.name} = {named[member.name]:g}{member.suffix}"
-                for member in self.characteristics
-                if member.name in bound.constraint.sum
-            ]
-            total = f"{bound.constraint.total(named):g}{bound.suffix}"
-            quantity = f"{bound.constraint.quantity} = {total}"
-            raise InputError(
-                "",
-                f"violates a constraint: {quantity} ({', '.join(values)})",
-                bound.condition + otherwise,
-            )
+        infeasible = settings[~self.feasible(settings)]
+        if not len(infeasible):
+            return
+        values = self.characteristics.named(infeasible[0])
+        # The sum of all violations is above `BOUND_SLACK`, so that one is above this share.
+        bound = next(
+            bound
+            for bound in self.bounds
+            if bound.excess(values) > BOUND_SLACK / len(self.bounds)
+        )
+        texts = [
+            f"{member.name} = {values[member.name]:g}{member.suffix}"
+            for member in self.characteristics
+            if member.name in bound.constraint.sum
+        ]
+        total = f"{bound.constraint.total(values):g}{bound.suffix}"
+        quantity = f"{bound.constraint.quantity} = {total}"
+        raise InputError(
+            "",
+            f"violates a constraint: {quantity} ({', '.join(texts)})",
+            bound.condition + otherwise,
+        )
 
     def repaired(self, settings: FloatArray) -> FloatArray:
         """Settings, shape (N, n), moved towards the original setting until they are feasible after
@@ -152,15 +153,16 @@ class FeasibleRegion:
         `filtered`, settings that are feasible after the filter. There are fewer settings if
         `REJECTIONS` draws for each do not suffice. `draw(k)` draws k settings.
         """
-        drawn = np.zeros((0, len(self.characteristics)))
+        feasible_settings = np.zeros((0, len(self.characteristics)))
         draws = 0
-        while (shortage := number - len(drawn)) and draws < REJECTIONS * number:
+        while len(feasible_settings) < number and draws < REJECTIONS * number:
+            shortage = number - len(feasible_settings)
             # If few settings are feasible, each batch doubles the number of draws.
             settings = draw(max(shortage, min(draws, LARGEST_DRAW)))
             draws += len(settings)
             accepted = settings[self._are_accepted(settings, filtered)]
-            drawn = np.concatenate([drawn, accepted[:shortage]])
-        return drawn
+            feasible_settings = np.concatenate([feasible_settings, accepted[:shortage]])
+        return feasible_settings
 
     def _are_accepted(self, settings: FloatArray, filtered: bool) -> BoolArray:
         if filtered:

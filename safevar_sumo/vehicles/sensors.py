@@ -79,7 +79,7 @@ class DelayedSignal:
         whole_steps = np.floor(age)
         first_sample = np.arange(sample.size).reshape(sample.shape)
         newer = whole_steps.astype(np.intp) * sample.size + first_sample
-        samples = np.repeat(sample[None], int(longest / step) + 2, axis=0)
+        samples = np.repeat(sample[np.newaxis], int(longest / step) + 2, axis=0)
         return cls(samples, newer, age - whole_steps)
 
     def where(self, chosen: BoolArray, history: DelayedSignal) -> DelayedSignal:

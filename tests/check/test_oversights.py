@@ -9,7 +9,12 @@ from pathlib import Path
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.check import OF_SIMULATORS, advice_for, check_study, oversights
+from safevar_sumo.check import (
+    ADVICE_FOR_SIMULATORS,
+    advice_for,
+    check_study,
+    oversights,
+)
 from safevar_sumo.check.trials import Finding
 from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.search import ALGORITHMS
@@ -162,8 +167,10 @@ def test_an_oversight_in_a_simulator_is_found_in_the_users_file(
 def test_advice_fits_a_simulator(in_tmp: Path) -> None:
     for name, text in SIMULATOR_FILES.items():
         write(name, text)
-    finding = Finding("alone", "", "", "", "")
-    assert advice_for(finding, load_study("truck.toml")) == OF_SIMULATORS["alone"]
+    finding = Finding("alone", "", "")
+    assert (
+        advice_for(finding, load_study("truck.toml")) == ADVICE_FOR_SIMULATORS["alone"]
+    )
     assert "over the vehicles" in advice_for(finding, load_study("smoke"))
 
 
