@@ -44,15 +44,11 @@ class Model(NamedTuple):
         Simulates settings with this parameter set.
     unsafe
         The criterion of an unsafe vehicle.
-    new_car
-        A criterion for the original vehicle: an encounter in which the original is unsafe by it
-        does not count. None if only the study's own rule decides.
     """
 
     fit: int
     evaluator: Evaluator
     unsafe: Unsafe
-    new_car: Unsafe | None = None
 
     @property
     def characteristics(self) -> CharacteristicSet:
@@ -77,22 +73,7 @@ class Model(NamedTuple):
         """The robustness of M settings (the distance to the limit of the criterion), shape (M,). A
         setting is unsafe below 0, and does not count at infinity.
         """
-        robustness = self.robustness_by(self.evaluate(settings, stage))
-        failing = np.flatnonzero(robustness < 0)
-        do_count = self.do_count(settings[failing], stage)
-        robustness[failing[~do_count]] = np.inf
-        return robustness
-
-    def do_count(self, settings: FloatArray, stage: str) -> BoolArray:
-        """Which of M settings have an encounter that counts, shape (M,): one in which the original
-        vehicle is safe by `new_car`, else a failure says nothing about changes of the vehicle. All
-        count without `new_car`.
-        """
-        if self.new_car is None:
-            return np.ones(len(settings), dtype=bool)
-        settings = self.characteristics.with_original_vehicle(settings)
-        originals = self.evaluate(settings, stage)
-        return originals.valid & ~self.new_car.of(originals)
+        return self.robustness_by(self.evaluate(settings, stage))
 
     def robustness_by(
         self, evaluations: Evaluations, failed: float = np.inf

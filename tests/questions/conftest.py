@@ -11,7 +11,7 @@ import pytest
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import batches
 from safevar_sumo.campaign.batches import Batches
-from safevar_sumo.questions import bench, by_criterion, evaluator, part
+from safevar_sumo.questions import by_criterion, evaluator, part, worlds
 from safevar_sumo.questions.repair import problem
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
@@ -36,7 +36,7 @@ def made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, name, either)
 
     replace_for_made_up_studies(batches, "choose_batches", Batches(100, True, False))
-    for module in (evaluator, by_criterion, bench, part, problem):
+    for module in (evaluator, by_criterion, worlds, part, problem):
         replace_for_made_up_studies(module, "assemble", smoke)
     for module in (evaluator, batches):
         replace_for_made_up_studies(module, "system_of", smoke)

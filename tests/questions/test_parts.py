@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.ask import find_question
-from safevar_sumo.questions.bench import moving_tests
 from safevar_sumo.questions.part import at_point, scope_of
+from safevar_sumo.questions.worlds import moving_tests
 from safevar_sumo.sumo.system import assemble
 from tests.support.in_process import SLOW, InlinePool, json_of, numbers_of
 from tests.support.made_up_studies import model_of
@@ -70,7 +69,7 @@ def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(
 ) -> None:
     study = at_point(sv.load_study("wear"), point)
     assert scope_of(study).startswith(scope)
-    assert moving_tests(model_of(study), Unsafe()) == []
+    assert moving_tests(model_of(study)) == []
 
 
 def test_a_study_at_one_of_its_points_has_no_constraint_of_its_ranges() -> None:

@@ -19,7 +19,6 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import cases, repair as question
-from safevar_sumo.questions.bench import bench_of
 from safevar_sumo.questions.drives import Drives
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
@@ -167,7 +166,8 @@ def test_cases_leave_what_vehicles_leave_unless_nobody_saves_them(name: str) -> 
     unsafe = Unsafe(keep=0.3)
     with open_evaluator(sv.load_study(name), InlinePool()) as evaluator:
         problem = RepairProblem(
-            bench=bench_of([Model(0, evaluator, unsafe)], unsafe, between=True),
+            models=[Model(0, evaluator, unsafe)],
+            between=True,
             promise=Promise.of(evaluator.study, evaluator.region, ["all"]),
             parameters=parameters_of(evaluator.study, ()),
             budget=100,

@@ -15,7 +15,7 @@ from safevar_sumo import load_study, tolerance
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.bench import Bench, DrivenWorld
+from safevar_sumo.questions.bench import Bench
 from safevar_sumo.questions.box import Box, prove
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.drives import Drives, Judged
@@ -34,6 +34,7 @@ from safevar_sumo.questions.tolerance.boxes import Attack
 from safevar_sumo.questions.tolerance.found import worst_of
 from safevar_sumo.questions.tolerance.search import find_limits
 from safevar_sumo.questions.words import bound_in_words
+from safevar_sumo.questions.worlds import DrivenWorld
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Limit, Study
