@@ -68,7 +68,8 @@ def remark_on_phases(claim: Model | None) -> str:
         return AT_ONE_PHASE
     rows = np.repeat(claim.characteristics.original_settings, 2, axis=0)
     rows[1, -1] = 1.0
-    at_begin, at_end = claim.robustness(rows, "phases of the original")
+    runs = claim.evaluate(rows, "phases of the original")
+    at_begin, at_end = np.where(runs.valid, claim.unsafe.robustness(runs), np.inf)
     return "" if np.isclose(at_begin, at_end, atol=SAME_ROBUSTNESS) else COUNTS_STEPS
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.random import Generator
 
+from safevar_sumo.questions.drives import Judged
 from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import FeasibleRegion
@@ -100,7 +101,7 @@ def _error_of(attempt: int) -> float:
 
 def prove(
     draw: Callable[[int], FloatArray],
-    judge: Callable[[FloatArray], FloatArray],
+    judge: Callable[[FloatArray], Judged],
     share: float,
     attempt: int,
 ) -> Proof:
@@ -111,8 +112,7 @@ def prove(
     draw
         Returns new settings of the box, as many as it is asked for.
     judge
-        Returns the robustness of M settings in E encounters, shape (M, E): below 0 the setting is
-        unsafe; NaN if it could not be simulated; infinite if it does not count in this encounter.
+        Simulates M settings, each in the same E encounters, one setting after another.
     share
         The upper bound that the test needs.
     attempt
@@ -143,12 +143,17 @@ def prove(
     # If all of these settings are safe, the bound is at most `share`.
     error = _error_of(attempt)
     settings = draw(proof_size(attempt, share))
-    robustness = judge(settings)
-    is_unsafe = (robustness < 0).any(axis=1)
-    has_failed = np.isnan(robustness).any(axis=1)
+    judged = judge(settings)
+
+    def in_any_encounter(is_so: BoolArray) -> BoolArray:
+        return np.asarray(is_so.reshape(len(settings), -1).any(axis=1))
+
+    is_unsafe = in_any_encounter(judged.is_unsafe)
+    has_failed = in_any_encounter(judged.counts & judged.failed)
+    is_measured = in_any_encounter(judged.is_measured)
 
     # For the upper bound, a setting that could not be simulated counts as unsafe.
-    samples = int(np.count_nonzero((robustness < np.inf).any(axis=1) | has_failed))
+    samples = int(np.count_nonzero(is_measured | is_unsafe | has_failed))
     failures = int(np.count_nonzero(is_unsafe))
     not_simulated = int(np.count_nonzero(has_failed & ~is_unsafe))
     safe = samples - failures - not_simulated

@@ -239,7 +239,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     else:
         runs = model.evaluate(settings, BEYOND_STAGE)
     failures = {}
-    is_told = (model.robustness_by(runs) < 0) | runs.standing
+    is_told = model.are_unsafe_by(runs) | runs.standing
     for row in np.flatnonzero(is_told).tolist():
         setting = settings[row]
         point = points[runs.points[row]]

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.case import Subject
@@ -69,34 +67,15 @@ class Model(NamedTuple):
         """The evaluations of M settings, shape (M, n)."""
         return self.evaluator.evaluate(settings, stage)
 
-    def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
-        """The robustness of M settings (the distance to the limit of the criterion), shape (M,). A
-        setting is unsafe below 0, and does not count at infinity.
-        """
-        return self.robustness_by(self.evaluate(settings, stage))
-
-    def robustness_by(
-        self, evaluations: Evaluations, failed: float = np.inf
-    ) -> FloatArray:
-        """The robustness of M evaluated settings, shape (M,): infinite where a constraint is
-        violated, `failed` where the setting could not be simulated.
-
-        Without a simulation a vehicle is neither safe nor unsafe. Each question says what it needs:
-
-        - infinity where only simulated failures count, as in a search for counterexamples;
-        - minus infinity where only simulated safety counts: each limit alone, and repairs;
-        - NaN where that is chosen later (`Oracle`).
-
-        `permit` raises an error instead, because every car of its list needs an answer.
-        """
-        robustness = self.unsafe.robustness(evaluations)
-        robustness = np.where(evaluations.valid, robustness, failed)
-        robustness[evaluations.infeasible] = np.inf
-        return robustness
-
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
         """Which of M settings are unsafe, shape (M,)."""
-        return self.robustness(settings, stage) < 0
+        return self.are_unsafe_by(self.evaluate(settings, stage))
+
+    def are_unsafe_by(self, evaluations: Evaluations) -> BoolArray:
+        """Which of M evaluated settings are unsafe, shape (M,). Without a valid simulation a
+        vehicle is neither safe nor unsafe.
+        """
+        return evaluations.valid & (self.unsafe.robustness(evaluations) < 0)
 
 
 class Models(NamedTuple):

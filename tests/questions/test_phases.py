@@ -20,7 +20,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.between import COUNTS_STEPS, DOMAIN, in_phases
 from safevar_sumo.questions.cases import SearchPlan, search_scope
-from safevar_sumo.questions.drives import Drives, Scope
+from safevar_sumo.questions.drives import Drives, Judged, Scope
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.part import at_point
@@ -137,7 +137,7 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     speeds = np.linspace(43, 47, 1601)
     settings = np.tile(original, (len(speeds), 1))
     settings[:, evaluator.characteristics.names.index("speed")] = speeds
-    left = model.robustness(settings, "speeds")
+    left = model.unsafe.robustness(model.evaluate(settings, "speeds"))
     tips = np.flatnonzero((np.abs(np.diff(left)) > 0.3)[:-1])
     lower = np.where(left[tips] < left[tips + 1], tips, tips + 1)
     assert len(lower) > 3
@@ -145,9 +145,10 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     claim = model.in_phases
     assert claim is not None
 
-    def judge(drives: Drives) -> FloatArray:
+    def judge(drives: Drives) -> Judged:
         settings = np.column_stack([drives.vehicle, drives.encounters.phase])
-        return claim.robustness(settings, "phases")
+        runs = claim.evaluate(settings, "phases")
+        return Judged.simulated(drives, claim.unsafe.robustness(runs))
 
     for row in some:
         setting = settings[row]

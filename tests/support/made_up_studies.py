@@ -13,7 +13,14 @@ from msgspec.structs import replace
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.drives import Drives, Encounters, Scope
+from safevar_sumo.questions.drives import (
+    AreUnsafe,
+    Drives,
+    Encounters,
+    Judge,
+    Judged,
+    Scope,
+)
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -22,6 +29,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 from tests.support.in_process import InlinePool
 from tests.support.made_up import made_up_evaluations
 
+Robustness = Callable[[Drives], FloatArray]
+"""The robustness of M made-up drives, shape (M,): below 0 unsafe."""
 ONE_TEST = {
     "title": "one test",
     "matrix": {
@@ -139,3 +148,12 @@ def places(*values: float) -> Encounters:
 
 def drives_of(*vehicles: list[float]) -> Drives:
     return Drives(np.array(vehicles), places(*[0.0] * len(vehicles)))
+
+
+def judge_by(robustness: Robustness) -> Judge:
+    """A judge of drives that all count and have valid simulations."""
+    return lambda drives: Judged.simulated(drives, robustness(drives))
+
+
+def are_unsafe_by(robustness: Robustness) -> AreUnsafe:
+    return lambda drives: robustness(drives) < 0

@@ -17,7 +17,6 @@ import numpy as np
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.causes import Cause
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import Model
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -276,7 +275,7 @@ def _robustness(
         causes.append(
             Cause(changes, str(outcome), float(degree), encounter, float(of_runs))
         )
-    robustness = Model(0, evaluator, unsafe).robustness_by(runs)
+    robustness = np.where(runs.valid, unsafe.robustness(runs), np.inf)
     is_confirmed = evaluator.confirmed(runs, unsafe)
     robustness[(robustness < 0) & ~is_confirmed] = 0.0
     return robustness, causes, int(np.count_nonzero(runs.standing))

@@ -19,7 +19,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import cases, repair as question
-from safevar_sumo.questions.drives import Drives
+from safevar_sumo.questions.drives import Drives, Judged
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.repair import (
@@ -35,7 +35,7 @@ from safevar_sumo.questions.repair.problem import (
     parameters_of,
 )
 from safevar_sumo.questions.tables import AnswerTable
-from safevar_sumo.records import FloatArray, differences
+from safevar_sumo.records import BoolArray, FloatArray, differences
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
@@ -124,11 +124,13 @@ class Adding:
     def __init__(self, parameters: int, need: float) -> None:
         self.today, self._need = np.full(parameters, 0.1), need
 
-    def robustness_of_changes(
-        self, shares: FloatArray, drives: Drives, stage: str
-    ) -> FloatArray:
-        gain = np.clip(shares - self.today, 0, 0.85).sum(axis=1)
-        return np.subtract.outer(gain, self._need * drives.vehicle[:, 0])
+    def survive(self, shares: FloatArray, drives: Drives, stage: str) -> BoolArray:
+        judged = [self.outcomes(change, drives, stage) for change in shares]
+        return np.array([not of_change.is_unsafe.any() for of_change in judged])
+
+    def outcomes(self, change: FloatArray, drives: Drives, stage: str) -> Judged:
+        gain = np.clip(change - self.today, 0, 0.85).sum()
+        return Judged.simulated(drives, gain - self._need * drives.vehicle[:, 0])
 
 
 @pytest.mark.parametrize(
@@ -174,22 +176,22 @@ def test_cases_leave_what_vehicles_leave_unless_nobody_saves_them(name: str) -> 
         )
         vehicles = problem.promise.draw(6, default_rng(1))
         drives = Drives.product(vehicles, problem.encounters)
-        left = problem.robustness_of_change(problem.today, drives, "")
+        left = problem.outcomes(problem.today, drives, "").robustness
         expected = unsafe.robustness(evaluator.evaluate(vehicles, ""))
         assert left.reshape(6, -1).min(axis=1) == pytest.approx(expected)
         is_saved = problem.repairable(drives)
         assert is_saved.all() == (name == "rain")
-        counted = np.where(is_saved, left, np.inf)
-        assert_array_equal(
-            problem.counted_robustness(problem.today, drives, ""), counted
-        )
+        judged = problem.judge(problem.today, drives, "")
+        assert_array_equal(judged.robustness, left)
+        assert_array_equal(judged.counts, is_saved | (left >= 0))
 
         # Between the tests only encounters count that a new vehicle survives today.
         drives.encounters.place[:] = 0.37
         drives.encounters.phase[:] = 0.37
         originals = problem.bench.originals_in(drives.encounters)
-        survives = problem.robustness_of_change(problem.today, originals, "") >= 0
-        assert_array_equal(problem.is_promised(drives.encounters), survives)
+        today = problem.outcomes(problem.today, originals, "")
+        is_promised = problem.is_promised(drives.encounters)
+        assert_array_equal(is_promised, ~today.is_not_safe)
 
 
 def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:

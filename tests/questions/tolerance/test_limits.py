@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 
 import numpy as np
@@ -25,7 +26,7 @@ from safevar_sumo.questions.cases import (
 )
 from safevar_sumo.questions.drives import (
     Drives,
-    Judge,
+    Judged,
     Scope,
     from_matrix,
     to_matrix,
@@ -41,8 +42,15 @@ from safevar_sumo.questions.tolerance.boxes import (
     shrink,
     widen,
 )
-from safevar_sumo.records import FloatArray
-from tests.support.made_up_studies import drives_of, places, scope_of
+from safevar_sumo.records import BoolArray, FloatArray
+from tests.support.made_up_studies import (
+    Robustness,
+    are_unsafe_by,
+    drives_of,
+    judge_by,
+    places,
+    scope_of,
+)
 
 pytestmark = pytest.mark.usefixtures("made_up_studies")
 
@@ -54,7 +62,7 @@ def star_of(n: int) -> Scope:
 
 
 def boxes_of(
-    n: int, judge: Judge, given: dict[tuple[int, int], float] | None = None
+    n: int, robustness: Robustness, given: dict[tuple[int, int], float] | None = None
 ) -> Boxes:
     """Boxes around 5 of which some sides are given."""
     longest = np.full((2, n), 5.0)
@@ -63,7 +71,12 @@ def boxes_of(
         longest[side] = length
         is_free[side] = False
     return Boxes(
-        judge, scope_of(n), np.full(n, 5.0), longest, is_free, lambda sides: sides
+        are_unsafe_by(robustness),
+        scope_of(n),
+        np.full(n, 5.0),
+        longest,
+        is_free,
+        lambda sides: sides,
     )
 
 
@@ -71,15 +84,16 @@ def nothing(n: int) -> Failures:
     return Failures.known(scope_of(n).nothing)
 
 
-def search_of(judge: Judge, budget: int, seed: int = 0) -> Search:
+def search_of(robustness: Robustness, budget: int, seed: int = 0) -> Search:
     rng = default_rng(seed)
+    judge = judge_by(robustness)
     return lambda scope, known: search_scope(
         judge, scope, known, SearchPlan(budget), rng
     )
 
 
-def unsafe_where(region: Judge) -> Judge:
-    """A judge that knows no distance."""
+def unsafe_where(region: Callable[[Drives], BoolArray]) -> Robustness:
+    """A robustness that knows no distance."""
     return lambda drives: np.where(region(drives), -1.0, 1.0)
 
 
@@ -107,25 +121,26 @@ def moving(drives: Drives) -> FloatArray:
     return np.asarray(9 - (vehicle - 5).sum(axis=1) - 2 * wave)
 
 
-def unsafe_in(boxes: Boxes, sides: FloatArray, judge: Judge) -> int:
+def unsafe_in(boxes: Boxes, sides: FloatArray) -> int:
     """The unsafe of 20,000 cases of a box, by another draw than that of the search."""
     scope = boxes.scope_of(sides)
     drives = draw(scope, 20_000, default_rng(9))
-    return int((judge(drives) < 0).sum())
+    return int(boxes.are_unsafe(drives).sum())
 
 
-def largest(boxes: Boxes) -> FloatArray:
+def largest(boxes: Boxes, robustness: Robustness) -> FloatArray:
     start = nothing(len(boxes.original))
-    quick, thorough = search_of(boxes.judge, 1024, 0), search_of(boxes.judge, 5000, 1)
+    quick, thorough = search_of(robustness, 1024, 0), search_of(robustness, 5000, 1)
     settled = find_largest_box(boxes, start, quick, thorough, default_rng(0))
     assert settled.sides is not None
     assert settled.attack.simulated >= 5000
+    assert settled.attack.least is not None
     assert settled.attack.least >= 0
     return settled.sides
 
 
 @pytest.mark.parametrize(
-    ("judge", "n", "given", "optimum", "share"),
+    ("robustness", "n", "given", "optimum", "share"),
     [
         (linear, 3, {}, 0.375, 0.97),
         (linear, 3, {(1, 2): 2.0}, 0.315, 0.97),
@@ -141,30 +156,29 @@ def largest(boxes: Boxes) -> FloatArray:
     ],
 )
 def test_the_box_is_nearly_the_largest_and_holds_nothing_unsafe(
-    judge: Judge,
+    robustness: Robustness,
     n: int,
     given: dict[tuple[int, int], float],
     optimum: float,
     share: float,
 ) -> None:
     """Also where a limit is given."""
-    boxes = boxes_of(n, judge, given)
-    sides = largest(boxes)
+    boxes = boxes_of(n, robustness, given)
+    sides = largest(boxes, robustness)
     volume = np.exp(boxes.log_volume(sides))
     assert share * optimum < volume <= 1.05 * optimum
     assert {side: sides[side] for side in given} == given
-    assert not unsafe_in(boxes, sides, judge)
+    assert not unsafe_in(boxes, sides)
 
 
 def test_no_box_where_what_is_given_fails() -> None:
-    boxes = boxes_of(
-        2, unsafe_where(lambda drives: drives.vehicle[:, 0] > 7), {(1, 0): 4.0}
-    )
+    robustness = unsafe_where(lambda drives: drives.vehicle[:, 0] > 7)
+    boxes = boxes_of(2, robustness, {(1, 0): 4.0})
     settled = settle(
         boxes,
         nothing(2),
         boxes.longest,
-        [search_of(boxes.judge, 2000)],
+        [search_of(robustness, 2000)],
     )
     assert settled.sides is None
     assert settled.failures.boxes == 1, "nothing can cut this off"
@@ -173,16 +187,18 @@ def test_no_box_where_what_is_given_fails() -> None:
 def test_a_search_finds_the_encounter_in_which_a_value_alone_is_unsafe() -> None:
     """Where the place is from 0.4 to 0.5, above 7; a scan at place 0 shows nothing."""
 
-    def judge(drives: Drives) -> FloatArray:
+    def robustness(drives: Drives) -> FloatArray:
         is_there = np.abs(drives.encounters.place[:, 0] - 0.45) < 0.05
         value = drives.vehicle[:, 0]
         return np.where(is_there & (value > 7), -1.0, 10 - value)
 
     star = star_of(2)
     start = Alone(star.lower, star.upper)
-    scanned = scan_alone(judge, star, start, places(0.0), 100, PARTS)
+    are_unsafe = are_unsafe_by(robustness)
+    scanned = scan_alone(are_unsafe, star, start, places(0.0), 100, PARTS)
     assert scanned.upper.tolist() == [10, 10]
-    limits = search_alone(judge, star, scanned, search_of(judge, 2000), PARTS)
+    search = search_of(robustness, 2000)
+    limits = search_alone(are_unsafe, star, scanned, search, PARTS)
     assert limits.upper.tolist() == [pytest.approx(7, abs=0.02), 10]
     assert limits.upper[0] <= 7
 
@@ -194,12 +210,11 @@ def test_a_value_whose_limit_never_settles_stays_as_in_the_original() -> None:
     def search(scope: Scope, known: Drives) -> Counterexamples:
         scopes.append(scope)
         drives = drives_of([scope.upper[0], 5.0], [5.0, scope.lower[1]])
-        return Counterexamples(drives, np.array([-1.0, -1.0]))
+        return Counterexamples(Judged.simulated(drives, np.array([-1.0, -1.0])))
 
     start = Alone(star.lower, star.upper)
-    limits = search_alone(
-        lambda drives: np.ones(len(drives)), star, start, search, (2,)
-    )
+    are_unsafe = are_unsafe_by(lambda drives: np.ones(len(drives)))
+    limits = search_alone(are_unsafe, star, start, search, (2,))
     assert limits.upper.tolist() == [5, 10]
     assert limits.lower.tolist() == [0, 5]
     assert len(scopes) == MOST_SEARCHES
@@ -226,12 +241,13 @@ def test_a_star_changes_one_value_and_a_scope_holds_its_drives() -> None:
 def test_a_search_ends_soon_after_a_failure_or_with_its_budget() -> None:
     scope = scope_of(3)
     rng = default_rng(0)
-    met = search_scope(tooth, scope, scope.nothing, SearchPlan(5000), rng)
+    judge = judge_by(tooth)
+    met = search_scope(judge, scope, scope.nothing, SearchPlan(5000), rng)
     assert met.least == -1
     assert met.simulated < 5000
     assert (tooth(met.unsafe) < 0).all()
     met = search_scope(
-        lambda drives: 1 + drives.vehicle[:, 0],
+        judge_by(lambda drives: 1 + drives.vehicle[:, 0]),
         scope,
         drives_of([0.25, 5, 5]),
         SearchPlan(1000),
@@ -241,7 +257,7 @@ def test_a_search_ends_soon_after_a_failure_or_with_its_budget() -> None:
     assert met.least == 1
     assert not len(met.unsafe)
     known = drives_of([6.25, 6.5, 6.5])
-    assert search_scope(tooth, scope, known, SearchPlan(1), rng).least == -1, (
+    assert search_scope(judge, scope, known, SearchPlan(1), rng).least == -1, (
         "known ones come first"
     )
 
@@ -296,16 +312,16 @@ def test_a_cut_keeps_off_failures_by_its_clearance_and_cuts_no_given_side() -> N
 def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsafe() -> (
     None
 ):
-    judge = unsafe_where(
+    robustness = unsafe_where(
         lambda drives: (drives.vehicle[:, 0] > 7) & (drives.vehicle[:, 1] < 3)
     )
-    boxes = boxes_of(3, judge)
+    boxes = boxes_of(3, robustness)
     unsafe = drives_of([9, 1, 8], [8, 2, 5])
-    causes = reduce_changes(judge, boxes.original, unsafe)
+    causes = reduce_changes(boxes.are_unsafe, boxes.original, unsafe)
     assert causes.vehicle.tolist() == [[9, 1, 5], [8, 2, 5]]
     known = learn(boxes, nothing(3), unsafe, boxes.longest)
     assert known.boxes == 1
-    assert (judge(known.drives) < 0).all()
+    assert boxes.are_unsafe(known.drives).all()
     assert known.drives.vehicle[:, 0].min() == pytest.approx(7, abs=0.02), (
         "nearly the first on its way"
     )
@@ -314,10 +330,10 @@ def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsa
 
 
 def test_a_box_grows_up_to_a_wall_and_shrinks_from_what_is_beyond() -> None:
-    judge = unsafe_where(
+    robustness = unsafe_where(
         lambda drives: (drives.vehicle[:, 0] > 7) & (drives.vehicle[:, 1] > 4)
     )
-    boxes = boxes_of(2, judge)
+    boxes = boxes_of(2, robustness)
     known = nothing(2)._replace(positions=drives_of([1.0, 0.0]))
     inner = shrink(boxes, known, boxes.longest)
     assert inner[1, 0] == pytest.approx(2, abs=0.02)
@@ -334,15 +350,15 @@ def test_a_scan_meets_each_value_in_each_encounter_and_a_limit_ends_in_the_worst
     """Unsafe: above 6 at place 0, above 8 at place 1, and the second value below 1 at place 1."""
     judged = list[Drives]()
 
-    def judge(drives: Drives) -> FloatArray:
+    def are_unsafe(drives: Drives) -> BoolArray:
         judged.append(drives)
         first, second = drives.vehicle.T
         place = drives.encounters.place[:, 0]
-        return np.where((first > 6 + 2 * place) | (second < place), -1.0, 1.0)
+        return np.asarray((first > 6 + 2 * place) | (second < place))
 
     star = star_of(2)
     start = Alone(np.array([0.0, 0.0]), np.array([10.0, 5.0]))
-    limits = scan_alone(judge, star, start, places(0.0, 1.0), 10, (2, 2))
+    limits = scan_alone(are_unsafe, star, start, places(0.0, 1.0), 10, (2, 2))
     assert limits.lower.tolist() == [0, 1]
     assert limits.upper.tolist() == [6, 5]
     scanned = Drives.concatenate(judged[:2]).vehicle
@@ -355,31 +371,31 @@ def test_a_scan_meets_each_value_in_each_encounter_and_a_limit_ends_in_the_worst
 
 
 def test_what_a_search_keeps_is_the_worst_that_counts() -> None:
-    start = Counterexamples(scope_of(1).nothing, np.zeros(0))
+    start = Counterexamples.of_nothing(scope_of(1))
     values = np.r_[np.inf, np.arange(40.0)[::-1]]
     drives = drives_of(*([value] for value in values.tolist()))
-    met = start.after(drives, values)
-    assert met.scores.tolist() == [*range(PARENTS)]
+    met = start.after(Judged.simulated(drives, values))
+    assert met.judged.robustness.tolist() == [*range(PARENTS)]
     assert (met.simulated, met.least, len(met.unsafe)) == (41, 0, 0)
-    every = met.after(drives, values - 39.5)
+    every = met.after(Judged.simulated(drives, values - 39.5))
     assert len(every.drives) == len(every.unsafe) == 40, "all unsafe ones"
     assert every.least == -39.5
 
 
 def test_a_box_settles_a_step_further_inwards_after_each_failure() -> None:
     """Failures above 7: the first box meets them, the second keeps off by 0.4 of 2 %."""
-    boxes = boxes_of(1, unsafe_where(lambda drives: drives.vehicle[:, 0] > 7))
+    robustness = unsafe_where(lambda drives: drives.vehicle[:, 0] > 7)
+    boxes = boxes_of(1, robustness)
     scopes = list[Scope]()
 
     def search(scope: Scope, starts: Drives) -> Counterexamples:
         scopes.append(scope)
-        met = Counterexamples(scope.nothing, np.zeros(0))
         at_end = drives_of([scope.upper[0]])
-        return met.after(at_end, boxes.judge(at_end))
+        return Counterexamples.of_nothing(scope).after(judge_by(robustness)(at_end))
 
     def other(scope: Scope, starts: Drives) -> Counterexamples:
         assert len(starts) == 1
-        return Counterexamples(starts, np.array([0.25]), 20)
+        return Counterexamples(Judged.simulated(starts, np.array([0.25])), 20)
 
     known = nothing(1)
     settled = settle(boxes, known, boxes.longest, [search, other])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -45,6 +46,7 @@ from tests.support.made_up_studies import (
     Plant,
     Region,
     box as corner,
+    drives_of,
     made_up_evaluator,
     made_up_model,
     made_up_study,
@@ -172,8 +174,9 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe() -> None:
     """
     q, wrong, seeds, region = 0.031, 0, 100, region_of(made_up_study(2))
 
-    def judge(settings: FloatArray) -> FloatArray:
-        return np.log(np.abs(settings[:, :1] - 5) + 1e-99) * 1e6 % 1 - q
+    def judge(settings: FloatArray) -> Judged:
+        robustness = np.log(np.abs(settings[:, 0] - 5) + 1e-99) * 1e6 % 1 - q
+        return Judged.simulated(drives_of(*settings.tolist()), robustness)
 
     for seed in range(seeds):
         for attempt in range(1, 12):
@@ -192,12 +195,8 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe() -> None:
 
 
 def test_the_bound_of_a_first_test_without_failure_is_one_sided() -> None:
-    proof = prove(
-        lambda number: np.zeros((number, 2)),
-        lambda _: np.zeros((1228, 1)),
-        0.003,
-        1,
-    )
+    safe = Judged.simulated(drives_of(*[[0.0]] * 1228), np.zeros(1228))
+    proof = prove(lambda number: np.zeros((number, 2)), lambda _: safe, 0.003, 1)
     assert (1 - proof.at_most) ** 1228 == pytest.approx(0.05)
     assert bound_in_words(proof.at_most) == "with 95 % confidence at most 0.244 %"
 
@@ -249,8 +248,8 @@ class Sliver(Bench[DrivenWorld]):
     def drive(self, drives: Drives, stage: str = "") -> Judged:
         share = drives.encounters.place[:, 0]
         collides = (drives.vehicle > 9.9).all(axis=1) & (share > 0.695)
-        scores = np.where(share > 0.7, np.inf, 1 - 2.0 * collides)
-        return Judged.of_scores(drives, scores)
+        judged = Judged.simulated(drives, 1 - 2.0 * collides)
+        return replace(judged, counts=share <= 0.7)
 
 
 def test_a_search_begins_where_encounters_only_just_count() -> None:
@@ -294,7 +293,7 @@ def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> N
 
 
 def test_the_worst_clearance_is_what_is_left_beside_the_margin_of_its_set() -> None:
-    attacks = {0: Attack(least=0.2), 2: Attack(least=0.4), 3: Attack(least=np.inf)}
+    attacks = {0: Attack(least=0.2), 2: Attack(least=0.4), 3: Attack(least=None)}
     assert worst_of(Unsafe(keep=0.3), attacks) == 0.4
 
 
