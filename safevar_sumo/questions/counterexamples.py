@@ -57,8 +57,8 @@ class Failure(NamedTuple):
 
     Attributes
     ----------
-    setting
-        The vehicle's values, and those of its encounter, as they are printed, shape (n,).
+    failing_values
+        The vehicle's values, and those of its encounter, as they are printed, by name.
     words
         How and where the vehicle fails, such as `the vehicle hits a pedestrian (impact at 12 km/h;
         test CPNA)`. If runs differ, the words also say how many fresh runs fail.
@@ -70,7 +70,7 @@ class Failure(NamedTuple):
         The command that simulates the vehicle.
     """
 
-    setting: FloatArray
+    failing_values: NamedValues
     words: str
     point: JsonObject
     breach: str
@@ -142,9 +142,10 @@ def values_as_printed(
             for row, setting in enumerate(settings)
         ]
     printed = describe(model, settings, single_names=names, further=further)
-    for row, failure in printed.items():
-        settings[row] = failure.setting
-    return list(map(members.named, settings))
+    return [
+        printed[row].failing_values if row in printed else members.named(setting)
+        for row, setting in enumerate(settings)
+    ]
 
 
 def solution_with_fewest_changes(case: Case) -> FloatArray | None:
@@ -264,7 +265,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
         if fails_in := runs_in_words(model.unsafe.failing_runs(run)[:, 0]):
             event += f" and {fails_in}"
         failures[row] = Failure(
-            setting,
+            members.named(setting),
             f"the vehicle {event}",
             point.parameters,
             breach,

@@ -28,8 +28,6 @@ from safevar_sumo.questions.drives import (
     Drives,
     Judged,
     Scope,
-    from_matrix,
-    to_matrix,
 )
 from safevar_sumo.questions.tolerance.boxes import (
     Boxes,
@@ -231,10 +229,10 @@ def test_a_star_changes_one_value_and_a_scope_holds_its_drives() -> None:
     rows = _Rows(scope, default_rng(2))
     drawn = rows.draw(3000)
     for each in (drawn, rows.children(drawn[:PARENTS], 3000)):
-        drives = from_matrix(each, 4)
+        drives = rows.drives(each)
         assert scope.holds(drives).all()
         assert {*drives.encounters.world.tolist()} == {0, 1, 2}
-    vehicle = from_matrix(drawn, 4).vehicle
+    vehicle = rows.drives(drawn).vehicle
     assert np.isin(vehicle, [0, 10]).mean() == pytest.approx(0.5, abs=0.02)
 
 
@@ -264,8 +262,9 @@ def test_a_search_ends_soon_after_a_failure_or_with_its_budget() -> None:
 
 def test_children_lie_between_beside_and_around_their_parents() -> None:
     """Moved ones at nine places of parents at 4 and 5; others change about one value of seven."""
-    parents = np.repeat(to_matrix(drives_of([4.0] * 4, [5.0] * 4)), 16, axis=0)
-    children = _Rows(scope_of(4), default_rng(0)).children(parents, 4000)
+    rows = _Rows(scope_of(4), default_rng(0))
+    parents = np.repeat(rows.of(drives_of([4.0] * 4, [5.0] * 4)), 16, axis=0)
+    children = rows.children(parents, 4000)
     between = {
         pulled + shift for pulled in (4.0, 4.5, 5.0) for shift in (-0.7, 0.0, 0.7)
     }
@@ -366,8 +365,10 @@ def test_a_scan_meets_each_value_in_each_encounter_and_a_limit_ends_in_the_worst
     assert {*np.diff(np.unique(scanned[:, 0]))} == {0.5}
     assert [len(drives) for drives in judged[2:]] == [3, 3]
     failure = limits.breaches[1, 0]
-    assert to_matrix(failure).tolist() == [[6.125, 5, 0, 0, 0]]
-    assert to_matrix(limits.breaches[0, 1]).tolist() == [[5, 0.875, 0, 0, 1]]
+    assert failure.vehicle.tolist() == [[6.125, 5]]
+    assert failure.encounters.place.tolist() == [[0]]
+    assert limits.breaches[0, 1].vehicle.tolist() == [[5, 0.875]]
+    assert limits.breaches[0, 1].encounters.place.tolist() == [[1]]
 
 
 def test_what_a_search_keeps_is_the_worst_that_counts() -> None:
