@@ -324,8 +324,9 @@ class Question:
             open_progress(progress) as show,
             open_evaluator(study, pool, jobs, show, cluster) as opened,
         ):
-            account = opened.account
-            opened.limit(simulations, questions, quick=is_quick)
+            opened.allow(simulations, questions, quick=is_quick)
+            budget = opened.budget
+            tally = opened.tally
             for subject in subjects:
                 if isinstance(subject, Case) and not as_it_is_now:
                     opened.for_study(subject.study).refuse_other_original(subject)
@@ -349,9 +350,9 @@ class Question:
         rough: list[Sentence] = []
         if is_quick:
             rough = [ROUGH if has_sets else ROUGH_WITHOUT_SETS]
-        if account.limit is not None:
-            numbers |= {"rough": True, "simulations": account.spent}
-            rough = [ROUGH_OF_FEW(most=account.limit)]
+        if budget.limit is not None:
+            numbers |= {"rough": True, "simulations": budget.spent}
+            rough = [ROUGH_OF_FEW(most=budget.limit)]
         if self.has_rough_answer:
             numbers["rough"] = bool(rough or numbers.get("rough"))
         sentences = [
@@ -359,13 +360,13 @@ class Question:
             *rough,
             *Verdict.of(result.verdict).sentences,
             *cites,
-            note(account.undefined_in_words),
-            note(account.collided_in_words),
+            note(tally.undefined_in_words),
+            note(tally.collided_in_words),
         ]
-        numbers["never_moved"] = len(account.standing)
-        if account.standing and numbers["driven"]:
-            sentences.append(STANDING(count=account.standing_in_words))
-        limit = account.allowance if account.limit is None else account.limit
+        numbers["never_moved"] = len(tally.standing)
+        if tally.standing and numbers["driven"]:
+            sentences.append(STANDING(count=tally.standing_in_words))
+        limit = budget.stated if budget.limit is None else budget.limit
         return replace(
             result,
             verdict=Verdict(sentences),
@@ -401,7 +402,7 @@ class Question:
 
         study = evaluator.study
         reason = NOBODY_MOVED(
-            count=evaluator.account.standing_in_words,
+            count=evaluator.tally.standing_in_words,
             command=f"{PROGRAM_COMMAND} check {study.words}",
         )
         return Answer(

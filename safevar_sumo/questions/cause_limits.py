@@ -93,7 +93,9 @@ def find_cause_limits(
         where=is_scaled,
     )
     number = len(starts) * settings_of_line(PARTS)
-    is_coarse = evaluator.left is not None and evaluator.left < 2 * number
+    is_coarse = (
+        evaluator.settings_left is not None and evaluator.settings_left < 2 * number
+    )
     parts = COARSE_PARTS if is_coarse else PARTS
     with evaluator.phases.stage(BOUNDARIES, len(starts) * settings_of_line(parts)):
         shares, limits, states = _first_unsafe_shares(

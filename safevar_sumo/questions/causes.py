@@ -87,7 +87,7 @@ def find_minimal_causes(
     with evaluator.phases.stage(SUBSETS, _count_subsets(numbers, complete)):
         for size in range(max(numbers, default=0) + 1):
             without_cause = compress(numbers, map(operator.not_, causes))
-            room = evaluator.left
+            room = evaluator.settings_left
             if (
                 size > complete
                 and room is not None
@@ -179,8 +179,7 @@ def select_affordable_rows(
     costs = 2.0 ** evaluator.characteristics.number_changed(settings)
     order = np.random.default_rng(evaluator.seed).permutation(len(settings))
     smallest_number = int(
-        evaluator.account.is_limited
-        and len(evaluator.characteristics) < max_evaluations
+        evaluator.budget.is_few and len(evaluator.characteristics) < max_evaluations
     )
     number = max(
         smallest_number, np.count_nonzero(np.cumsum(costs[order]) <= max_evaluations)

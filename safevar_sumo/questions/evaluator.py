@@ -35,17 +35,16 @@ from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, Unsafe
 from safevar_sumo.questions.between import in_phases
+from safevar_sumo.questions.budget import QUICK_EFFORTS, QUICK_SECONDS, Budget
 from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.price import (
     MEASURED,
-    QUICK_EFFORTS,
-    QUICK_SECONDS,
-    Account,
     print_price_of_list,
     seconds_of_simulation,
 )
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
+from safevar_sumo.questions.tally import Tally
 from safevar_sumo.records import (
     BoolArray,
     Evaluations,
@@ -82,8 +81,9 @@ class Evaluator:
     ----------
     simulated
         Number of settings simulated so far. Equal settings in one call are simulated only once.
-    account
-        The simulations of the question, also of evaluators of other studies for this question.
+    budget, tally, phases
+        How much the question may simulate, what came out of its simulations, and its progress.
+        Evaluators of other studies for this question share them.
 
     Examples
     --------
@@ -100,7 +100,6 @@ class Evaluator:
         pool: Pool,
         progress: Progress = show_no_progress,
         verified: int = VERIFIED_SETTINGS,
-        account: Account | None = None,
     ) -> None:
         self.study = study
         with about(study.source):
@@ -111,8 +110,9 @@ class Evaluator:
         self.simulated = 0
         self._stays = dict[tuple[Selection, bytes], bool]()
         """Whether the original vehicle never moves, by selection and encounter."""
-        self.account = account or Account(Phases(progress))
-        self.phases = self.account.phases
+        self.budget = Budget()
+        self.tally = Tally()
+        self.phases = Phases(progress)
 
     @property
     def seed(self) -> int:
@@ -187,7 +187,7 @@ class Evaluator:
         """
         repeats = self.study.scenario.repeats
         runs = self.number_of_fresh_runs(len(settings))
-        self.account.spend(len(settings) * self._each * runs // repeats)
+        self.budget.spend(len(settings) * self._each * runs // repeats)
         scenario = replace_in(self.study.scenario, repeats=runs)
         task = Task(study=replace_in(self.study, scenario=scenario))
         parts = np.array_split(settings, min(len(settings), 4 * self._pool.workers))
@@ -202,7 +202,8 @@ class Evaluator:
         """The number of fresh runs of each setting, if so many settings are evaluated anew."""
         repeats = self.study.scenario.repeats
         runs = max(repeats, FRESH_RUNS)
-        if self.left is not None and self.left * repeats < 4 * runs * settings:
+        left = self.settings_left
+        if left is not None and left * repeats < 4 * runs * settings:
             return repeats
         return runs
 
@@ -216,57 +217,72 @@ class Evaluator:
         if not self.has_repeats or not len(rows):
             return is_unsafe
         is_unsafe[:] = False
-        if self.left is None or len(rows) <= self.left:
+        if self.settings_left is None or len(rows) <= self.settings_left:
             fresh_runs = self.evaluate_anew(evaluations.settings[rows])
             is_unsafe[rows] = unsafe.of(fresh_runs)
         return is_unsafe
 
     def begin(
-        self, settings: NamedValues, minimum: int = 1, *, of_list: bool = False
+        self,
+        settings: NamedValues,
+        minimum: int = 1,
+        *,
+        of_list: bool = False,
+        is_most: bool = False,
     ) -> None:
-        """Begin a question. `settings` has the expected number of settings of each phase of
-        progress. With fewer than `minimum` settings there is no answer. A question `of_list` (of
-        vehicles) prints how long it takes even if a simulation is short.
+        """Begin a question.
+
+        Parameters
+        ----------
+        settings
+            The usual number of settings of each stage, times the effort.
+        minimum
+            The least number of settings with which there is an answer.
+        of_list
+            Whether the question is about a list of vehicles: then it prints how long it takes even
+            if a simulation is short.
+        is_most
+            Whether no more settings than those of all stages may be simulated.
         """
         expected = sum(settings.values())
-        account = self.account
+        budget = self.budget
         system = self.system
         pool = self._pool
-        if account.is_question:
+        if budget.is_question:
             number = minimum + MEASURED * system.mover.takes_long
-            account.require(account.spent + number * self._each)
+            budget.require(budget.spent + number * self._each)
             if system.mover.takes_long:
-                if account.allowance is not None:
-                    pool.spare = spare(account.allowance, account.minimum)
+                if budget.stated is not None:
+                    pool.spare = spare(budget.stated, budget.minimum)
                 opened_by(self.study, pool)
             seconds = seconds_of_simulation(self.study, system, pool)
-            account.open(
+            budget.open(
                 expected * self._each, seconds, pool.checked, at_once=pool.workers
             )
             if seconds is not None:
-                account.spend(MEASURED * self._each)
-            elif of_list and not account.is_limited:
+                budget.spend(MEASURED * self._each)
+            elif of_list and not budget.is_few:
                 simulations = expected * len(system.points)
                 print_price_of_list(self.study, system, pool, simulations)
-        share = 1.0 if self.left is None else self.left / expected
+        left = self.settings_left
+        share = 1.0 if left is None else left / expected
         planned = {name: share * number for name, number in settings.items()}
-        self.phases.plan(planned, len(system.points), account.left)
+        if is_most:
+            budget.most = budget.spent + int(expected * self._each)
+        self.phases.plan(planned, len(system.points), budget.left)
 
     @property
-    def left(self) -> int | None:
-        """The number of settings that may still be simulated; None without a limit."""
-        account = self.account
-        if account.limit is None:
-            return None
-        return int(account.left) // self._each
+    def settings_left(self) -> int | None:
+        """For how many settings few simulations still suffice; None if they are not few."""
+        return self.budget.settings_left(self._each)
 
-    def limit(
+    def allow(
         self, simulations: int | None, questions: int, *, quick: bool = False
     ) -> None:
-        """Limit the number of simulations of the question, which includes the check of a
-        simulator's class. `questions` questions share the time. A quick question searches less.
+        """Make the budget of the question. It includes the check of a simulator's class.
+        `questions` questions share the time. A quick question searches less.
         """
-        account = self.account
+        effort = 1.0
         if quick:
             durations = [
                 np.max(point.scenario.duration) for point in self.system.points
@@ -274,36 +290,18 @@ class Evaluator:
             seconds = sum(durations)
             if self.study.ranges:
                 seconds *= ENCOUNTERS
-            account.effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK_EFFORTS))
-        account.allowance = account.limit = simulations
-        account.questions = questions
-        account.is_question = True
+            effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK_EFFORTS))
+        self.budget = Budget(simulations, quick, effort, questions, is_question=True)
         self._pool.spare = None
         if simulations is not None and self.system.mover.takes_long:
             self._pool.spare = spare(simulations, 0)
         self._pool.checked = 0
 
-    def bound(self, settings: float) -> None:
-        """Let the simulations that follow suffice for at most so many settings. The bar of progress
-        never shows more.
-        """
-        account = self.account
-        account.most = account.spent + int(settings * self._each)
-        self.phases.bound(int(settings * len(self.system.points)))
-
-    def scaled(self, number: float) -> int:
-        """A usual number of simulations or rounds, times the effort of the question."""
-        return int(number * self.account.effort)
-
-    def at_most(self, number: int, part: int = 1) -> int:
-        """A usual number of settings, times the effort of the question, but at least 1. If the
-        number of simulations is limited, at most 1 / `part` of the settings that may follow.
-        """
-        number = self.scaled(number)
-        if self.left is not None:
-            # If runs differ, each unsafe setting is simulated again.
-            number = min(number, self.left // (part * (1 + self.has_repeats)))
-        return max(number, 1)
+    def of_stage(self, usual: int, part: int = 1) -> int:
+        """The number of settings of a stage (`Budget.of_stage`)."""
+        # If runs differ, each unsafe setting is simulated again.
+        price = (1 + self.has_repeats) * self._each
+        return self.budget.of_stage(usual, price, part)
 
     @property
     def _each(self) -> int:
@@ -316,11 +314,11 @@ class Evaluator:
         verified: int,
         selection: Selection = EVERYTHING,
     ) -> Evaluations:
-        """Evaluate settings, show progress, and count simulations in the account."""
+        """Evaluate settings, show progress, and count the simulations."""
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         total = len(np.unique(settings, axis=0))
-        self.account.spend(total * self._each)
+        self.budget.spend(total * self._each)
         points = len(selection.of(system_of(self.study)).points)
         self.phases.begin_part(stage, points * total)
         evaluations = evaluate_all(
@@ -337,7 +335,7 @@ class Evaluator:
         if selection == EVERYTHING:
             counted = self._without_unsafe_originals(evaluations)
         counted = self._without_standing(counted, selection)
-        self.account.count(evaluations, counted.standing)
+        self.tally.count(evaluations, counted.standing)
         return counted
 
     def _compile(self) -> None:
@@ -358,8 +356,8 @@ class Evaluator:
             evaluations = replace(evaluations, stands=stands)
         of_vehicle = self.characteristics.of_vehicle
         changed = (settings != self.characteristics.original)[:, of_vehicle].any(axis=1)
-        self.account.has_moved |= bool((changed & evaluations.valid).any())
-        self.account.standing |= {
+        self.tally.has_moved |= bool((changed & evaluations.valid).any())
+        self.tally.standing |= {
             row.tobytes() for row in settings[stands][:, of_vehicle]
         }
         return evaluations
@@ -374,8 +372,8 @@ class Evaluator:
         keys = [(selection, row.tobytes()) for row in originals]
         rows = {key: row for row, key in enumerate(keys) if key not in self._stays}
         price = len(rows) * self._each
-        if rows and price <= self.account.left:
-            self.account.spend(price)
+        if rows and price <= self.budget.left:
+            self.budget.spend(price)
             unknown = originals[list(rows.values())]
             runs = evaluate_all(
                 self.study, unknown, self._pool, verified=0, selection=selection
@@ -449,7 +447,7 @@ class Evaluator:
         if not len(self.characteristics.scenario):
             return Evaluations.none(len(self.characteristics), METRICS)
         # An eighth of few simulations chooses encounters: the others are for vehicles in them.
-        settings = sobol_settings(self.characteristics, self.at_most(CANDIDATES, 8))
+        settings = sobol_settings(self.characteristics, self.of_stage(CANDIDATES, 8))
         originals = self.characteristics.with_original_vehicle(settings)
         return self.evaluate(originals, "encounters of the original")
 
@@ -502,7 +500,7 @@ class Evaluator:
             return
         if not self.system.mover.is_exact:
             jobs = [(Task(study=study), self.characteristics.original_settings)]
-            self.account.spend(self._each)
+            self.budget.spend(self._each)
             (evaluations,) = carry_out(evaluate_settings, jobs, self._pool)
             refuse_other_original(Path(case.name), case.original, record(evaluations))
 
@@ -533,18 +531,18 @@ class Evaluator:
         stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
         # Most of few simulations should serve the question, and not the choice of a criterion.
-        evaluations = self.evaluate(settings[: self.at_most(FIRST_SETTINGS, 8)], stage)
-        if not evaluations.collided.any() and not self.account.is_limited:
+        evaluations = self.evaluate(settings[: self.of_stage(FIRST_SETTINGS, 8)], stage)
+        if not evaluations.collided.any() and not self.budget.is_few:
             evaluations = self.evaluate(settings, stage)
         return Unsafe.default_among(evaluations, original)
 
     def use(self, unsafe: Unsafe) -> None:
-        """Use a criterion in the question. The account counts the settings that meet it. Raises the
+        """Use a criterion in the question. The tally counts the settings that meet it. Raises the
         errors of `checked`.
         """
         self.checked(unsafe)
         if not unsafe.is_collision:
-            self.account.criterion = unsafe
+            self.tally.criterion = unsafe
         if unsafe.bound:
             self.check_measured(unsafe.measure)
 
@@ -586,12 +584,16 @@ class Evaluator:
         self.phases.log_end()
 
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
-        """An evaluator of another study, on the same pool and account. In addition, `verified`
-        settings are simulated in SUMO.
+        """An evaluator of another study for the same question, on the same pool. In addition,
+        `verified` settings are simulated in SUMO.
         """
         if verified is None:
             verified = self._verified
-        return Evaluator(study, self._pool, verified=verified, account=self.account)
+        evaluator = Evaluator(study, self._pool, verified=verified)
+        evaluator.budget = self.budget
+        evaluator.tally = self.tally
+        evaluator.phases = self.phases
+        return evaluator
 
 
 @contextmanager

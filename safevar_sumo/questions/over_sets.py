@@ -75,7 +75,7 @@ def simulate_sample(
     """
     vehicles = model.draw(number, np.random.default_rng(evaluator.seed))
     evaluations = evaluator.evaluate(vehicles, stage)
-    evaluator.account.refuse_standing()
+    evaluator.tally.refuse_standing()
     if not evaluations.valid.any():
         raise SimulationError(
             f"study {evaluator.study.name!r}: none of {number} vehicles could be simulated"
@@ -153,7 +153,7 @@ class SharesOverSets(NamedTuple):
         is_chosen = is_first | (in_groups & (np.cumsum(in_groups) <= VEHICLES))
         members = np.array([is_first, *groups])[:, is_chosen]
         rows = []
-        if not evaluator.account.is_limited and other_sets(evaluator.study, fits):
+        if not evaluator.budget.is_few and other_sets(evaluator.study, fits):
             models = models_of(evaluator, unsafe, fits, with_unsafe_originals=True)
             for model in models.members:
                 evaluations = model.evaluator.evaluate(settings[is_chosen], SETS_STAGE)

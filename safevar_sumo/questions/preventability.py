@@ -51,7 +51,10 @@ def has_reference_drivers(evaluator: Evaluator) -> bool:
     simulator of the user that has its own driving system. They do not if only few simulations are
     allowed.
     """
-    return evaluator.system.mover.has("a driving system") and evaluator.left is None
+    return (
+        evaluator.system.mover.has("a driving system")
+        and evaluator.settings_left is None
+    )
 
 
 def assess_sample(

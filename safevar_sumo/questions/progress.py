@@ -72,10 +72,6 @@ class Phases:
         self.plan(settings, points)
         self._never_grows = True
 
-    def bound(self, simulations: int) -> None:
-        """Show no larger total than that of so many further simulations."""
-        self._most = self._done + simulations
-
     def begin_part(self, part: str, simulations: int) -> None:
         """Begin a part of `simulations` simulations, which may be a phase or belong to a phase."""
         if not self._is_stage:

@@ -12,10 +12,8 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions import price
-from safevar_sumo.questions.price import Account, round_down
-from safevar_sumo.questions.progress import Phases
-from safevar_sumo.terminal import show_no_progress
+from safevar_sumo.questions import budget, price
+from safevar_sumo.questions.budget import Budget, round_down
 from tests.support.in_process import SLOW, InlinePool, refused, run, write
 from tests.support.wall import MODELS, STUDY
 
@@ -146,18 +144,18 @@ def test_a_quick_explanation_announces_an_eighth_of_a_whole_one(
 
 
 def test_more_simulations_than_are_planned_are_a_bound_too() -> None:
-    account = Account(Phases(show_no_progress), allowance=120)
-    account.open(100, None)
-    account.spend(120)
+    allowed = Budget(stated=120)
+    allowed.open(100, None)
+    allowed.spend(120)
     with pytest.raises(InputError, match="120 do not suffice: 121"):
-        account.spend(1)
+        allowed.spend(1)
 
 
 def test_many_more_simulations_search_more_and_not_roughly() -> None:
-    for allowance, effort in ((120, 1.0), (1000, 5.0), (10**9, 8.0)):
-        account = Account(Phases(show_no_progress), allowance=allowance)
-        account.open(100, None)
-        assert (account.limit, account.effort) == (None, effort)
+    for stated, effort in ((120, 1.0), (1000, 5.0), (10**9, 8.0)):
+        allowed = Budget(stated=stated)
+        allowed.open(100, None)
+        assert (allowed.limit, allowed.effort) == (None, effort)
 
 
 COUNTED = """
@@ -253,15 +251,15 @@ def test_what_decides_is_said_from_enough_vehicles(rig: str) -> None:
 def test_what_takes_long_by_default_is_limited_and_said_first(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    account = Account(Phases(show_no_progress), minimum=2201)
+    allowed = Budget(minimum=2201)
     with pytest.raises(InputError, match="an answer takes at least 2,201"):
-        account.open(10_000, 0.4)
-    assert account.limit == 2200
+        allowed.open(10_000, 0.4)
+    assert allowed.limit == 2200
     assert (
         "at most 2,200 simulations, about 0:14:40, of about 10,000"
         in capsys.readouterr().err
     )
-    other = Account(Phases(show_no_progress))
+    other = Budget()
     other.open(1000, 0.4)
     assert other.limit is None
     assert "about 1,000 simulations, about 0:06:40" in capsys.readouterr().err
@@ -275,7 +273,7 @@ def test_the_time_of_one_simulation_is_that_of_one(
     at_once: int, told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """100 simulations take 15 s with any number at the same time: the mean is 0.15 s."""
-    Account(Phases(show_no_progress)).open(100, 0.15, at_once=at_once)
+    Budget().open(100, 0.15, at_once=at_once)
     text = capsys.readouterr().err
     assert "about 100 simulations, about 0:00:15" in text
     assert told in text
@@ -284,7 +282,7 @@ def test_the_time_of_one_simulation_is_that_of_one(
 def test_a_slow_simulator_gets_a_rough_answer(
     rig: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(price, "LONGEST_QUESTION", 0.5)
+    monkeypatch.setattr(budget, "LONGEST_QUESTION", 0.5)
     monkeypatch.setattr(
         "safevar_sumo.questions.evaluator.seconds_of_simulation", lambda *_: 0.001
     )

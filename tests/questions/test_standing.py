@@ -153,7 +153,7 @@ def test_each_encounter_is_compared_with_the_original_vehicle_in_it(
     assert evaluations.standing.tolist() == stands
     assert (~evaluations.valid).tolist() == stands
     assert np.isnan(evaluations.f_safe).tolist() == stands
-    assert evaluator.account.standing == {np.array([8, 7.0]).tobytes()}
+    assert evaluator.tally.standing == {np.array([8, 7.0]).tobytes()}
     assert Unsafe().of(evaluations).tolist() == [False, False, False, True]
 
 

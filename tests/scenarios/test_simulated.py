@@ -765,7 +765,7 @@ def test_a_pack_states_the_number_that_followed_from_time(
     """So that `verify` asks the same on another machine; so does the command of each answer."""
     run("study wall.toml --out results")
     with monkeypatch.context() as patch:
-        patch.setattr("safevar_sumo.questions.price.LONGEST_QUESTION", 0.4)
+        patch.setattr("safevar_sumo.questions.budget.LONGEST_QUESTION", 0.4)
         seconds = "safevar_sumo.questions.evaluator.seconds_of_simulation"
         patch.setattr(seconds, lambda *_: 0.001)  # whatever else this machine does
         run("evidence results --out pack.zip --ask 'risk --samples 4000'")
@@ -854,7 +854,7 @@ def test_an_interrupted_question_of_another_simulator_begins_anew(
             keep_simulations("risk"),
             open_evaluator(sv.load_study(str(wall)), InlinePool()) as it,
         ):
-            it.account.is_question = True
+            it.budget.is_question = True
             it.begin({"all": 1})
             found = it.evaluate(np.array([[8.0, 0.0], [4.0, 0.0]]), "all")
             if stops:

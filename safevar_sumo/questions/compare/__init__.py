@@ -168,7 +168,7 @@ def compare(
     # With few simulations, a third of them drives the pairs: a sixth in each version. The other two
     # thirds are for the limits.
     pairs, outside = pairs_of(
-        (subject, other), common, criteria, evaluator.at_most(samples, 6)
+        (subject, other), common, criteria, evaluator.of_stage(samples, 6)
     )
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
@@ -191,7 +191,7 @@ def compare(
     number_of_better = sum(difference.is_better for difference in differences)
     decision, why = _decide(differences, titles, of_originals, lacks)
     if decision == RELEASE:
-        evaluator.account.refuse_standing()
+        evaluator.tally.refuse_standing()
     numbers = {
         **({"driven": False} if second.no_verdict else {}),
         "decision": decision.lower(),

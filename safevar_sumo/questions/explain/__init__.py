@@ -12,6 +12,7 @@ import pandas as pd
 
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
+from safevar_sumo.questions.budget import LEAST_SETTINGS
 from safevar_sumo.questions.case import Case, Subject, are_collisions
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
@@ -62,7 +63,6 @@ from safevar_sumo.questions.preventability import (
     assess_sample,
     has_reference_drivers,
 )
-from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import ALREADY_UNSAFE
@@ -156,10 +156,10 @@ def explain(
     study, of_study = evaluator.study, of_study or isinstance(subject, Study)
     subject = study if of_study else subject
     limit = _plan(subject, evaluator, fits)
-    fits = 0 if evaluator.account.is_limited else fits
+    fits = 0 if evaluator.budget.is_few else fits
 
-    if evaluator.left is not None:
-        top = max(1, min(top, evaluator.left // FOR_ONE))
+    if evaluator.settings_left is not None:
+        top = max(1, min(top, evaluator.settings_left // FOR_ONE))
     population = gather_failures(subject, evaluator, solution, unsafe, fits)
     runs = population.evaluations
     # If the original vehicle is unsafe, no change is a cause of a failure. If encounters are
@@ -167,8 +167,8 @@ def explain(
     is_caused = bool(study.ranges or not population.unsafe.of(population.original)[0])
 
     # With few simulations, the minimal causes of failures get a quarter of what is left.
-    if evaluator.left is not None:
-        limit = evaluator.left // 4 * len(evaluator.system.points)
+    if evaluator.settings_left is not None:
+        limit = evaluator.settings_left // 4 * len(evaluator.system.points)
     top = 0 if of_study else top
     reasons, sample, causes, complete = choose_failures(
         population, evaluator, limit, top
@@ -239,15 +239,15 @@ def _plan(subject: Subject, evaluator: Evaluator, fits: int) -> int:
     """
     points = len(evaluator.system.points)
     if isinstance(subject, Study):
-        limit = evaluator.scaled(max(STUDY_LIMIT, OF_SAMPLE * points))
+        limit = evaluator.budget.by_effort(max(STUDY_LIMIT, OF_SAMPLE * points))
         planned = planned_over_sets(
-            subject, TO_EXPLAIN, evaluator.scaled(SAMPLED_SETTINGS), fits
+            subject, TO_EXPLAIN, evaluator.budget.by_effort(SAMPLED_SETTINGS), fits
         )
-        planned[COMBINATIONS] = evaluator.scaled(MAX_SETTINGS)
+        planned[COMBINATIONS] = evaluator.budget.by_effort(MAX_SETTINGS)
     else:
-        limit = evaluator.scaled(LIMIT)
+        limit = evaluator.budget.by_effort(LIMIT)
         planned = {TO_EXPLAIN: float(len(subject.solutions))}
-    later = {name: evaluator.scaled(number) for name, number in LATER.items()}
+    later = {name: evaluator.budget.by_effort(number) for name, number in LATER.items()}
     evaluator.begin(
         {**planned, SUBSETS: limit / points, **later}, minimum=LEAST_SETTINGS
     )

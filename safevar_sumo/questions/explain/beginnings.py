@@ -112,7 +112,7 @@ def with_sample(
 
     # Each cause has a line for all its changes, and one for each change.
     price = (1 + fewest) * (settings_of_line(PARTS) + STEPS)
-    number = evaluator.at_most(price * len(nearest), 4) // price
+    number = evaluator.of_stage(price * len(nearest), 4) // price
     chosen = list(nearest.values())[:number]
     limits = find_cause_limits(evaluator, chosen, unsafe)
     for cause, limit in zip(chosen, limits, strict=True):
@@ -192,11 +192,11 @@ def _begin(
     """The beginnings of causes, and smaller causes that were found where a cause begins."""
     # With few simulations, half of them are left to check the causes: with similar vehicles and in
     # other parameter sets.
-    is_free = not evaluator.account.is_limited
+    is_free = not evaluator.budget.is_few
     steps = STEPS if is_free else COARSE_STEPS
     causes = [cause for cause, _ in placed]
     prices = np.cumsum([steps + 2 ** len(cause.changes) for cause in causes])
-    number = int(np.count_nonzero(prices <= evaluator.at_most(int(prices[-1]), 2)))
+    number = int(np.count_nonzero(prices <= evaluator.of_stage(int(prices[-1]), 2)))
     beginnings = []
     for cause, share in placed:
         # At the ends, nobody knows where a cause begins.

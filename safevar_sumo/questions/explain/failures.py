@@ -133,7 +133,7 @@ def gather_failures(
 
     # Solutions are simulated again, because other files or versions may give other outcomes.
     evaluations = evaluator.evaluate(settings, TO_EXPLAIN)
-    evaluator.account.refuse_standing()
+    evaluator.tally.refuse_standing()
     unsafe = (
         evaluator.checked(criterion)
         if criterion
@@ -177,7 +177,7 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> Candidates:
     affordable = SAMPLED_SIMULATIONS // len(evaluator.system.points)
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
     # With few simulations, an eighth finds failures: most are needed to find the causes.
-    number = evaluator.at_most(number, 8)
+    number = evaluator.of_stage(number, 8)
     sampled_settings = VariationModel(study).draw(
         number, default_rng(study.search.seed), filtered=True
     )

@@ -53,10 +53,10 @@ def robust_shares(
     count.
     """
     count, factors = NEIGHBOUR_COUNT, STEP_FACTORS
-    if evaluator.account.effort < 1:
+    if evaluator.budget.effort < 1:
         count, factors = LEAST_NEIGHBOURS, factors[:1]
-    elif evaluator.left is not None:
-        count = min(count, evaluator.left // (6 * max(len(settings), 1)))
+    elif evaluator.settings_left is not None:
+        count = min(count, evaluator.settings_left // (6 * max(len(settings), 1)))
         factors = factors[:1]
     if count < LEAST_NEIGHBOURS:
         return np.full(len(settings), np.nan)

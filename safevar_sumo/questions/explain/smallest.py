@@ -102,13 +102,13 @@ class Smallest(NamedTuple):
         # causes that are found there can be made smaller. A third of the remaining simulations
         # finds the staircase. The rest checks how sure the causes are.
         at_ends = enumerate_causes(
-            evaluator, unsafe, evaluator.at_most(MAX_SETTINGS, 2)
+            evaluator, unsafe, evaluator.of_stage(MAX_SETTINGS, 2)
         )
         steps = staircase(
-            evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS, 3)
+            evaluator, unsafe, at_ends, evaluator.of_stage(MAX_SETTINGS, 3)
         )
         cures = count_cures(
-            evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS // CURES, 8)
+            evaluator, unsafe, at_ends, evaluator.of_stage(MAX_SETTINGS // CURES, 8)
         )
         known = find_beginnings(evaluator, unsafe, steps)
         beginnings = with_sample(evaluator, unsafe, known, sampled)
@@ -267,7 +267,7 @@ def _as_printed(
             beginning.boundary | encounter,
             beginning.cause.changes | encounter,
         ]
-    left = evaluator.left
+    left = evaluator.settings_left
     if left is not None and left < 2 * len(DIGITS_OF_SHARES) * len(vehicles):
         return list(beginnings)
     model = Model(0, evaluator, unsafe)

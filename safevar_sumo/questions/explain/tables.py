@@ -247,7 +247,9 @@ def _count_failing_runs(
     members = evaluator.characteristics
     for row in rows:
         row["failing_runs"] = row["runs"] = 0
-    chosen = rows if evaluator.left is None else rows[: evaluator.left]
+    chosen = (
+        rows if evaluator.settings_left is None else rows[: evaluator.settings_left]
+    )
     if not chosen:
         return
     vehicles = [row["boundary"] | (row.get("encounter") or {}) for row in chosen]

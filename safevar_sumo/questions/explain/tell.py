@@ -300,7 +300,7 @@ def _beyond(
     may be simulated.
     """
     members = evaluator.characteristics
-    number = evaluator.at_most(BEYOND, 4)
+    number = evaluator.of_stage(BEYOND, 4)
     at_cause = members.setting(cause | encounter, beyond=True)
     ends = np.where(at_cause > members.original, members.upper, members.lower)
     is_open = np.isin(members.names, list(cause)) & (ends != at_cause)

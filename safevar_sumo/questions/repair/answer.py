@@ -163,7 +163,7 @@ def _tested(
             fits=survivors.fits,
             number=sets,
         )
-    if problem.evaluator.account.effort >= 1:
+    if problem.evaluator.budget.effort >= 1:
         yield single_set_in_words(problem.study, sets)
     if survivors.broken:
         yield words.BROKEN(sets=fit_names(survivors.broken))

@@ -20,6 +20,7 @@ import pandas as pd
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import HIGH, LOW, Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
+from safevar_sumo.questions.budget import LEAST_SETTINGS
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.indices import (
@@ -41,7 +42,6 @@ from safevar_sumo.questions.over_sets import (
     planned_over_sets,
     simulate_sample,
 )
-from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.risk import words
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.sentence import Sentence, Sentences, Verdict
@@ -121,11 +121,11 @@ def risk(
     phases = planned_over_sets(study, SAMPLING, samples) | {SENSITIVITY: of_design}
     evaluator.begin(phases, minimum=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
-    samples = evaluator.at_most(samples)
-    if evaluator.left is not None:
+    samples = evaluator.of_stage(samples)
+    if evaluator.settings_left is not None:
         # With few simulations, the design is used only if it takes at most half of them.
-        has_design = has_design and 2 * of_design <= evaluator.left
-        samples = min(samples, evaluator.left - has_design * of_design)
+        has_design = has_design and 2 * of_design <= evaluator.settings_left
+        samples = min(samples, evaluator.settings_left - has_design * of_design)
     evaluations = simulate_sample(evaluator, model, samples, SAMPLING)
 
     simulated = evaluations.take(evaluations.valid)

@@ -22,6 +22,7 @@ from safevar_sumo.questions.answer import (
     tabulate,
 )
 from safevar_sumo.questions.ask import Criterion, question
+from safevar_sumo.questions.budget import LEAST_SETTINGS
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.options import Count
@@ -33,7 +34,6 @@ from safevar_sumo.questions.over_sets import (
     planned_over_sets,
     simulate_sample,
 )
-from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.rules import words
 from safevar_sumo.questions.sampling import clopper_pearson, share_with_interval
 from safevar_sumo.questions.sentence import Sentences, Verdict
@@ -116,7 +116,7 @@ def rules(
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)
-    samples = evaluator.at_most(samples)
+    samples = evaluator.of_stage(samples)
     model = VariationModel(study)
     evaluations = simulate_sample(evaluator, model, samples, SAMPLED_STAGE)
     vehicles = evaluations.settings

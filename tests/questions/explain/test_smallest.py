@@ -211,7 +211,7 @@ def test_a_cause_before_the_ends_is_not_at_the_end_where_few_simulations_are_all
         )
 
     evaluator = made_up_evaluator(2, region)
-    evaluator.account.limit = 200
+    evaluator.budget.limit = 200
     smallest, _ = answer_of(evaluator)
     assert smallest.table["begins_at"].tolist() == [0.35, 0.7]
 

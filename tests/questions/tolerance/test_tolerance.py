@@ -299,7 +299,7 @@ def test_the_worst_clearance_is_what_is_left_beside_the_margin_of_its_set() -> N
 
 def test_few_simulations_claim_nothing_of_a_set_that_they_do_not_reach() -> None:
     own = made_up_model(8, nowhere)
-    own.evaluator.account.limit = 600
+    own.evaluator.budget.limit = 600
     limits = find_limits(task_of(own, own._replace(fit=1), varied=range(8)))
     assert [*limits.attacks] == [0]
     assert limits.sides is None
@@ -319,7 +319,7 @@ def test_few_simulations_are_shared_between_limits_alone_and_the_box() -> None:
     # In ranges, a vehicle drives at all 6 points in 16 critical encounters, for 960 s. So the
     # effort is 25 / 960. Fewer than 8 values show no limit.
     evaluator = Evaluator(with_ranges(load_study("r152")), InlinePool())
-    evaluator.limit(None, 1, quick=True)
+    evaluator.allow(None, 1, quick=True)
     quick = effort_of(evaluator)
     assert (quick.values, quick.cases, quick.box.explored) == (8, 130, 0)
     assert (quick.cases_of_set, usual_alone(evaluator, 1)) == (26, 130)
