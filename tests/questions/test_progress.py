@@ -46,6 +46,7 @@ def assert_counts(shown: Shown) -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("few_simulations")
 @pytest.mark.parametrize(("ask", "options"), QUESTIONS)
 def test_phases_come_in_order_and_all_that_is_done_is_in_the_total(
     ask: Callable[..., Any], options: Mapping[str, Any]
