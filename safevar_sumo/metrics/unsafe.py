@@ -198,7 +198,10 @@ class Unsafe:
 
     def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
         """Return which rows of a data frame from `safevar_sumo.results.load_runs` are unsafe."""
-        return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
+        holds: pd.Series[bool] = self._holds(
+            solutions["outcome"], lambda name: solutions[name]
+        )
+        return holds
 
     def _holds(self, outcome: Any, column: ColumnOf) -> Quantity:
         collides = outcome == COLLISION

@@ -150,7 +150,7 @@ class Case:
         """Labels of the algorithms with solutions or a finished run, in the study's order."""
         names = {*self.solutions["algorithm"], *dict(self.finished_runs)}
         in_order = dict.fromkeys([*self.study.search.labels, *sorted(names)])
-        return tuple(filter(names.__contains__, in_order))
+        return tuple(name for name in in_order if name in names)
 
     def original_degrees(self, solutions: pd.DataFrame) -> pd.Series[float]:
         """For each solution, the safety degree of the original vehicle. If encounters are ranges,

@@ -209,7 +209,9 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
             metavar = str(extra)
     hints = (hint, *get_args(hint))
     is_repeated = any(get_origin(kind) is tuple for kind in hints)
-    kind = next(filter(hints.__contains__, (bool, int, float, Path)), str)
+    # A type that is none of these is that of a text.
+    kinds = [kind for kind in (bool, int, float, Path) if kind in hints]
+    kind = kinds[0] if kinds else str
     choices = ()
     if get_origin(hint) is Literal:
         choices = get_args(hint)

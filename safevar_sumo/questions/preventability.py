@@ -75,8 +75,10 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
     simulated. `verdicts` and `collisions` are the results of `assess_sample`.
     """
     rows = []
-    drivers = [*TITLES, *filter(verdicts.__contains__, OF_LANES)]
-    for driver in drivers if len(verdicts) else ():
+    drivers = []
+    if len(verdicts):
+        drivers = [*TITLES, *(driver for driver in OF_LANES if driver in verdicts)]
+    for driver in drivers:
         of_driver = verdicts[driver]
         number = int(of_driver.count())
         avoided = int(of_driver.sum())

@@ -331,8 +331,10 @@ def reader_columns(table: AnswerTable) -> Iterator[_ReaderColumn]:
         # A unit such as "as characteristic" says that the unit differs between rows.
         if column.unit not in ("", "-") and not column.unit.startswith("as "):
             head += f" [{column.unit}]"
+        # A column that is itself an end is there once.
+        shown = [part for part in dict.fromkeys((name, *ends)) if part in frame]
         yield _ReaderColumn(
-            list(filter(frame.__contains__, dict.fromkeys((name, *ends)))),
+            shown,
             head,
             column.meaning,
             _texts_of(table, name, ends),

@@ -63,9 +63,8 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
             rows = list(new.values())
             number = 10 + len(archive) // 10
             promising = number * 4 // 5
-            rows[promising:] = sorted(
-                rows[promising:], key=front.column("certainty").__getitem__
-            )
+            certainty = front.column("certainty")
+            rows[promising:] = sorted(rows[promising:], key=lambda row: certainty[row])
 
             # If the predictions give too few new settings, random settings are added. A search with
             # a smaller budget simulates the same first settings as a search with a larger budget.

@@ -151,7 +151,7 @@ def enumerate_causes(
 
         # The combinations whose single changes are worst in sum come first.
         candidates.sort(
-            key=lambda combination: sum(map(effects.__getitem__, combination))
+            key=lambda combination: sum(effects[change] for change in combination)
         )
         chosen = candidates[:room]
         room -= len(chosen)

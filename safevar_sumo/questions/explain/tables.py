@@ -87,7 +87,7 @@ def failures_frame(
     drivers = np.full(len(failures), None)
     drivers[is_assessed] = list(map(avoided_by, verdicts.to_dict("records")))
     columns = {
-        "solution": list(map(population.names.__getitem__, reasons)),
+        "solution": [population.names[row] for row in reasons],
         "reason": list(reasons.values()),
         "outcome": failures.outcome,
         "safety_degree": failures.f_safe,

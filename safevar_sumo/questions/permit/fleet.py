@@ -187,6 +187,14 @@ def list_without_names(path: Path, ignore: Collection[str]) -> bytes:
     return text.getvalue().encode()
 
 
+def _separator_in(head: str) -> str:
+    """The separator that a header has; "" if it has none."""
+    for separator in SEPARATORS:
+        if separator in head:
+            return separator
+    return ""
+
+
 def _cells_of_file(path: Path) -> _Cells:
     """The cells of a CSV file. The places are the file's name with the number of a line."""
     try:
@@ -210,8 +218,7 @@ def _cells_of_file(path: Path) -> _Cells:
     header_line = 2 if stated else 1
     head = re.sub('"[^"]*"', "", lines.readline())
     lines.seek(0)
-    separator = next(filter(head.__contains__, SEPARATORS), "")
-    separator = stated[1] if stated else separator
+    separator = stated[1] if stated else _separator_in(head)
     place = f"{path}, line {header_line}"
     if separator not in SEPARATORS or separator not in head:
         raise InputError(

@@ -163,7 +163,8 @@ def tables(
             words += [f"--{name}", quote(str(value))]
     has_runs = any(case.has_runs for case in cases)
     leading = OVER_RUNS if has_runs else POOLED
-    lead = next(filter(answer.tables.__contains__, leading), "")
+    present = [name for name in leading if name in answer.tables]
+    lead = present[0] if present else ""
     folded = AS_PUBLISHED if has_runs else ()
     return replace(answer, command=" ".join(words), lead=lead, folded=folded)
 
