@@ -24,7 +24,7 @@ from tests.support.in_process import (
     run,
     write,
 )
-from tests.support.processes import study, written
+from tests.support.processes import written
 
 pytestmark = pytest.mark.usefixtures("small")
 
@@ -77,7 +77,7 @@ def test_parts_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     assert not Path("out/solutions.csv").exists()
     assert len(load_runs("out").solutions.groupby(["algorithm", "run"])) == 6
     before = written(Path("out"))
-    study("--out out")
+    run("study small.toml --quiet --out out")
     assert written(Path("out")) == before, "nothing was left to simulate"
     assert solutions(Path("out")) == solutions(whole)
     sv.run("small.toml", "alone", only=keys[1:2])
@@ -92,14 +92,15 @@ def test_parts_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
 
 @SLOW
 def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> None:
-    assert "warning" not in study("--out out")
-    longer = study("--out out --evaluations 160")
+    again = "study small.toml --quiet --out out"
+    assert "warning" not in run(again).stderr
+    longer = run(f"{again} --evaluations 160").stderr
     assert (
         "out: each run had 150 evaluations before and has 160 now: an id such as nsga2:0:0 may name"
         " another solution" in longer
     )
     assert "left out" not in longer
-    fewer = study("--out out --evaluations 160 --runs 1 --algorithms nsga2,rs")
+    fewer = run(f"{again} --evaluations 160 --runs 1 --algorithms nsga2,rs").stderr
     assert (
         "out: earlier runs are left out of the results: nsga2-01, rs-01, safe_fuzzer-00,"
         " safe_fuzzer-01" in fewer

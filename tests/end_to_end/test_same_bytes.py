@@ -17,7 +17,6 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.search import ALGORITHMS
 from tests.support.formulas import FormulaPool, carried_out, solutions
 from tests.support.in_process import SLOW, run
-from tests.support.processes import study
 
 QUESTIONS = {
     "explain": "small.toml --quick --top 1",
@@ -42,7 +41,7 @@ def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(
 @SLOW
 @pytest.mark.usefixtures("small", "worker_processes")
 def test_a_search_has_the_same_bytes_in_two_worker_processes(whole: Path) -> None:
-    study("--jobs 2 --out out")
+    run("study small.toml --quiet --jobs 2 --out out")
     assert solutions(Path("out")) == solutions(whole)
 
 

@@ -13,10 +13,7 @@ from pathlib import Path
 
 import psutil
 
-from tests.support.in_process import run
-
 TIMEOUT = 60.0  # s
-SMALL_BATCHES = Path(__file__).parent / "small_batches.py"
 Process = subprocess.Popen[str]
 running = list[Process]()
 """Processes that a test has started."""
@@ -26,9 +23,7 @@ def started(typed: str, batch: int | None = None, **options: object) -> Process:
     """Start a command in its own process group and with Ctrl-C as a shell does, whatever this
     process ignores; with `batch`, in batches of at most so many settings.
     """
-    program = (
-        ["-m", "safevar_sumo"] if batch is None else [str(SMALL_BATCHES), str(batch)]
-    )
+    program = ["-m", "safevar_sumo"] if batch is None else [__file__, str(batch)]
     running.append(
         subprocess.Popen(
             [sys.executable, *program, *shlex.split(typed)],
@@ -112,6 +107,16 @@ def killed(process: Process) -> None:
     until(lambda: not left_of_group(process))
 
 
-def study(typed: str) -> str:
-    """Search the small study in this process, without a summary; returns the text on stderr."""
-    return run(f"study small.toml --quiet {typed}").stderr
+def run_in_batches(size: int) -> None:
+    """Run the program in this process with batches of at most so many settings: a study takes
+    longer, and can be interrupted at more places.
+    """
+    from safevar_sumo.campaign import campaign
+    from safevar_sumo.cli.program import run_command_line
+
+    campaign.efficient_batch = lambda system: size  # type: ignore[attr-defined]
+    run_command_line()
+
+
+if __name__ == "__main__":
+    run_in_batches(int(sys.argv.pop(1)))
