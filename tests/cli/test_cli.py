@@ -345,7 +345,6 @@ def test_a_log_has_command_versions_stages_and_warnings_of_each_call(
     assert len(re.findall(r"ended after [\d.]+ s$", log, re.MULTILINE)) == 3
     for folder in ("r1", "r2"):
         assert not [path for path in Path(folder).rglob("*") if "log" in path.name]
-    refused("risk smoke --log no/log.txt", "--log: no/log.txt cannot be written")
 
 
 def test_verbose_shows_stages_and_more_batches_and_silence_is_the_default() -> None:

@@ -37,7 +37,6 @@ from tests.support.in_process import (
     InlinePool,
     json_of,
     numbers_of,
-    refused,
     rows_of,
     write,
 )
@@ -172,10 +171,9 @@ def test_a_car_may_not_drive_where_it_fails_at_another_phase() -> None:
     assert numbers_of(row["simulate"])["f_safe"] < 0.3 <= numbers_of(at_0)["f_safe"]
 
 
-def test_simulate_takes_a_phase_and_says_where_there_is_none() -> None:
+def test_simulate_takes_a_phase() -> None:
     answer = json_of("simulate autoware_july --set phase=0.37124")
     assert "0.3712 steps" in answer["verdict"]
-    refused("simulate rain --set phase=0.5", "has no phase")
 
 
 @dataclass(frozen=True)
