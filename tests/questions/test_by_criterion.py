@@ -105,6 +105,7 @@ def test_every_question_takes_an_own_metric(folder: Path) -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
     criterion = "--unsafe 'hardest > 6.8'"
     studied = json_of(f"study tiny.toml --out results --quiet {criterion}")
@@ -129,6 +130,7 @@ def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_its_own(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -280,6 +280,7 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_the_page_replays_causes_in_their_encounters() -> None:
     run("report results --out page.html --ask 'explain --quick --top 2' --jobs 1")
     page = Path("page.html").read_text()

@@ -292,7 +292,8 @@ def test_a_slow_simulator_gets_a_rough_answer(
 
 
 @SLOW
-@pytest.mark.parametrize(("number", "cache"), [(400, "folder"), (2000, "off")])
+@pytest.mark.usefixtures("few_frames")
+@pytest.mark.parametrize(("number", "cache"), [(400, "folder"), (1000, "off")])
 def test_a_page_and_a_pack_share_one_number(
     rig: str, number: int, cache: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,7 +50,7 @@ def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
 
 
 @SLOW
-@pytest.mark.usefixtures("pools_in_this_process")
+@pytest.mark.usefixtures("pools_in_this_process", "few_frames")
 def test_a_rough_page_has_no_line_to_sign_and_no_other_parameter_set(
     slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -340,6 +340,7 @@ def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_a_report_of_two_results_compares_them(
     weathers: list[Path], in_tmp: Path
 ) -> None:
