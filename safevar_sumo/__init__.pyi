@@ -14,6 +14,7 @@ from .errors import (
 from .metrics import CriterionLike as CriterionLike, Unsafe as Unsafe
 from .questions.answer import Answer as Answer
 from .questions.ask import question as question
+from .questions.case import Results as Results
 from .questions.compare import compare as compare
 from .questions.explain import explain as explain
 from .questions.permit import permit as permit
@@ -21,7 +22,7 @@ from .questions.repair import repair as repair
 from .questions.research_questions.answer import figures as figures, tables as tables
 from .questions.risk import risk as risk
 from .questions.rules import rules as rules
-from .questions.subject import Results as Results, load as load
+from .questions.subject import load as load
 from .questions.tolerance import tolerance as tolerance
 from .records import Outcome as Outcome
 from .reference.agreement import validate as validate

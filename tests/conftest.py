@@ -17,7 +17,7 @@ from safevar_sumo.campaign import local
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.questions import cases, repair
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.case import Results, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.repair import survivors
@@ -146,13 +146,13 @@ def slippery(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def case(slippery: Path) -> Case:
+def case(slippery: Path) -> Results:
     """These results as a case."""
     return load_cases([slippery])[0]
 
 
 @pytest.fixture(scope="session")
-def explained(case: Case) -> Answer:
+def explained(case: Results) -> Answer:
     """Explanations of the failures in the results `slippery`."""
     return explain.compute(case, Evaluator(case.study, InlinePool()), top=3)
 

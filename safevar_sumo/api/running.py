@@ -12,8 +12,9 @@ from safevar_sumo.campaign.campaign import RECORDED
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.questions.arguments import checked
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.research_questions.fronts import why_few_evaluations
-from safevar_sumo.questions.subject import Results, load
+from safevar_sumo.questions.subject import load
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Progress, open_progress
@@ -97,7 +98,7 @@ def run(
             retry_failed=retry_failed,
         )
     results = load(directory)
-    remark = why_few_evaluations(results.case)
+    remark = why_few_evaluations(results)
     if remark:
         warn(remark)
     return results

@@ -19,7 +19,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion
 from safevar_sumo.questions.by_criterion import cases_by, study_by
-from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
+from safevar_sumo.questions.case import Results, UnanswerableError, are_collisions
 from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.options import Jobs, PointName, Range, UpTo
 from safevar_sumo.questions.part import part_of_study
@@ -31,7 +31,7 @@ from safevar_sumo.questions.research_questions.answer import (
 from safevar_sumo.questions.research_questions.comparisons import titles_of
 from safevar_sumo.questions.research_questions.tables import TABLES
 from safevar_sumo.questions.sentence import Sentence, Verdict
-from safevar_sumo.questions.subject import Results, load
+from safevar_sumo.questions.subject import load
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import (
     ALREADY_UNSAFE,
@@ -204,7 +204,7 @@ def study(
 def _refuse_undefined(results: Results) -> None:
     """Refuse an objective that no simulated vehicle has: the search then has no solutions."""
     simulated = results.evaluations
-    for objective in results.case.scoring.objectives:
+    for objective in results.scoring.objectives:
         if len(simulated) and simulated[objective.name].isna().all():
             raise InputError(
                 results.study.source,
@@ -226,12 +226,12 @@ def _found(
     progress("the fewest unsafe changes", 0, 1)
     answer = summarise(results)
     reason = why_no_verdict(system)
-    (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
+    (case,) = cases_by([results], unsafe, jobs, show_no_progress)
     criterion = "" if unsafe is None else f" --unsafe {quote(str(unsafe))}"
     advice = f"{PROGRAM_COMMAND} explain {study}{criterion}"
 
     # Questions refuse studies whose original vehicle is unsafe in the original encounter.
-    demanded = results.case.scoring.safe_original
+    demanded = results.scoring.safe_original
     if demanded is not None and results.original[ORIGINAL_DEGREE] < demanded:
         advice = (
             "a smaller scenario.margin, or original values of the axes with which the"
@@ -298,11 +298,11 @@ def number_standing(results: Results) -> int:
         return 0
     simulated = results.evaluations
     standing = simulated[simulated["outcome"] == Outcome.NEVER_MOVED]
-    names = list(results.case.characteristics.names)
+    names = list(results.characteristics.names)
     return len(standing.drop_duplicates(names))
 
 
-def _breach_of_original(case: Case) -> str:
+def _breach_of_original(case: Results) -> str:
     """How the original vehicle is unsafe, in words. "" if the original vehicle is safe, or if the
     study searches encounters.
     """
@@ -317,7 +317,7 @@ def _breach_of_original(case: Case) -> str:
 
 
 def _verdict(
-    results: Results, case: Case, jobs: int | None, study: str
+    results: Results, case: Results, jobs: int | None, study: str
 ) -> tuple[list[Sentence], list[JsonObject]]:
     """The verdict on a case: how many solutions are unsafe, and how few changes suffice. The rows
     of `CHANGES` list the changes of the vehicle with the fewest changes.
@@ -393,28 +393,27 @@ def summarise(results: Results) -> Answer:
     InputError
         If the results are imported.
     """
-    case = results.case
     study = results.study
-    if not case.has_runs:
+    if not results.has_runs:
         raise InputError(
-            results.directory,
+            results.directory or results.name,
             "holds imported solutions, which have no runs",
             "results of the command `study`",
         )
 
     metrics = {
         metric.name: Column(metric.unit, "mean over solutions", ".2f", is_detail=True)
-        for metric in case.scoring.metrics
+        for metric in results.scoring.metrics
     }
     all_simulated = results.evaluations
     all_solutions = results.solutions
-    finished = case.run_counts
+    finished = results.run_counts
     rows = []
     for name in study.search.labels:
         simulated = all_simulated[all_simulated["algorithm"] == name]
         solutions = all_solutions[all_solutions["algorithm"] == name]
         outcomes = Counter(simulated["outcome"])
-        feasible = simulated[case.scoring.feasible_rows(simulated)]
+        feasible = simulated[results.scoring.feasible_rows(simulated)]
         rows.append(
             {
                 "algorithm": name,
@@ -430,13 +429,15 @@ def summarise(results: Results) -> Answer:
             }
         )
 
-    table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
+    table = tabulate(
+        study.title, ALGORITHMS | metrics, rows, words=titles_of([results])
+    )
     tables = {"algorithms": table}
 
     # If no test can be significant with so few runs, its table is folded, with a remark.
     untested = []
     with suppress(UnanswerableError):
-        run_tables = answer_questions([case], names=RUN_TESTS).tables
+        run_tables = answer_questions([results], names=RUN_TESTS).tables
         tables |= run_tables.records
         untested = [
             name for name in RUN_TESTS if not run_tables[name]["enough_runs"].any()

@@ -44,7 +44,6 @@ from safevar_sumo.questions.options import (
 )
 from safevar_sumo.questions.sentence import Sentence, Verdict, answer, note
 from safevar_sumo.questions.subject import (
-    Results,
     part_of,
     study_in,
     study_or_case,
@@ -58,7 +57,7 @@ from safevar_sumo.terminal import Parts, Progress, open_progress, print_text
 if TYPE_CHECKING:
     from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.questions.answer import Answer
-    from safevar_sumo.questions.case import Subject
+    from safevar_sumo.questions.case import Results, Subject
     from safevar_sumo.questions.evaluator import Evaluator
 
 QUESTIONS = {
@@ -129,7 +128,7 @@ class Question:
                 f"takes ({', '.join(map(str, parameters))})",
                 "(subject, evaluator), then other subjects, * and options",
             )
-        self.takes_results_only = str(parameters[0].annotation) == "Case"
+        self.takes_results_only = str(parameters[0].annotation) == "Results"
         self.others = {
             parameter.name: str(parameter.annotation) == "Path"
             for parameter in parameters[2:]
@@ -310,7 +309,7 @@ class Question:
             Number of questions that share the time, such as all questions of a page.
         """
         from safevar_sumo.questions.by_criterion import subject_by
-        from safevar_sumo.questions.case import Case
+        from safevar_sumo.questions.case import Results
 
         # The evaluator loads SUMO, which takes long: import it only when a question is asked.
         from safevar_sumo.questions.evaluator import open_evaluator
@@ -328,7 +327,7 @@ class Question:
             budget = opened.budget
             tally = opened.tally
             for subject in subjects:
-                if isinstance(subject, Case) and not as_it_is_now:
+                if isinstance(subject, Results) and not as_it_is_now:
                     opened.for_study(subject.study).refuse_other_original(subject)
             unsafe, values, cites = self._criterion(values, study)
             evaluator = opened
@@ -508,7 +507,7 @@ def question(compute: Callable[..., Answer]) -> Question:
     """Decorator that makes a question of a function `(subject, evaluator, *, options) -> Answer`.
 
     The function's signature states the defaults of the options, `Annotated` types state their
-    ranges, and the numpydoc docstring explains them. If the first parameter has the type `Case`,
+    ranges, and the numpydoc docstring explains them. If the first parameter has the type `Results`,
     the question takes only results. Each further positional parameter is a further subject, or a
     file if its type is `Path`.
     """
@@ -561,6 +560,8 @@ def find_question(name: str) -> Question:
 
 def _name(source: StudyLike | Results) -> str:
     """The name of a subject on the command line: a directory of results, or a study."""
+    from safevar_sumo.questions.case import Results
+
     if isinstance(source, Results):
         return str(source.directory)
     if isinstance(source, Study):

@@ -12,7 +12,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import OPTIONAL_METRICS, Unsafe
-from safevar_sumo.questions.case import Case, Subject
+from safevar_sumo.questions.case import Results, Subject
 from safevar_sumo.questions.evaluator import Evaluator, open_evaluator
 from safevar_sumo.study import Study
 from safevar_sumo.study.encounters import DecidingMetric
@@ -67,12 +67,12 @@ def subject_by(
 
 
 def cases_by(
-    cases: Sequence[Case],
+    cases: Sequence[Results],
     unsafe: Unsafe | None,
     jobs: int | None,
     progress: Progress,
     cluster: str | None = None,
-) -> list[Case]:
+) -> list[Results]:
     """Results, adapted to a criterion. Without a criterion, results stay as they are, unless their
     study states a clearance as its criterion.
 
@@ -91,7 +91,7 @@ def cases_by(
     return cases
 
 
-def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
+def case_by(case: Results, unsafe: Unsafe, evaluator: Evaluator) -> Results:
     """Results, adapted to a criterion. If the criterion bounds a metric that the results lack, or
     that belongs to another point of a matrix, all solutions are simulated again.
     """

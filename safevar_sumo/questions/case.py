@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -42,24 +43,31 @@ class UnanswerableError(InputError):
     """The results lack the data that a question needs."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Case:
-    """The results of one study.
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Results:
+    """The results of one study; its runs may be unfinished.
 
     Attributes
     ----------
     name
-        Name of the case in tables.
+        Name of the results in tables.
     study
         The study as it was run.
     original
-        The original vehicle's metrics by name; NaN where undefined.
+        The original vehicle's outcome, metrics and objectives as plain values, None where
+        undefined.
     solutions
-        The vehicles that the searches returned, as `safevar_sumo.results.load_runs` returns them.
+        One row per solution of every finished run. Columns: algorithm, run (absent from imported
+        results), the characteristics in their table units, f_safe [m or -m/s], f_diff [fraction],
+        f_num_diff, the metrics in their units (NaN where undefined), outcome.
     evaluations
-        All simulated vehicles, as `load_runs` returns them.
-    finished_runs
+        One row per simulated setting of every run, in the order of the run's requests; same columns
+        as `solutions`. If encounters are ranges, `feasible` is true where the original vehicle is
+        safe in the same encounter: only these count.
+    finished
         Algorithm and number of every finished run.
+    directory
+        The directory of the results; None if they were not read from one.
     scoring
         The metrics, and the objectives that the search minimises.
     has_runs
@@ -76,16 +84,35 @@ class Case:
 
     name: str
     study: Study
-    original: NamedValues
+    original: JsonObject
     solutions: pd.DataFrame
     evaluations: pd.DataFrame
-    finished_runs: tuple[RunName, ...]
+    finished: tuple[RunName, ...]
+    directory: Path | None = None
     has_runs: bool = True
     failures: tuple[tuple[str, str], ...] = ()
     scoring: Scoring = PUBLISHED_SCORING
     titles: Mapping[str, str] = field(default_factory=dict)
     stop_by_themselves: Collection[str] = ("safe_fuzzer",)
     stated: Unsafe | None = None
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>\n{self.solutions.to_html(max_rows=10, index=False)}"
+
+    def __repr__(self) -> str:
+        return (
+            f"<Results of {self.name} in {self.directory}: {len(self.finished)} runs,"
+            f" {len(self.solutions)} solutions>"
+        )
+
+    @property
+    def original_metrics(self) -> NamedValues:
+        """The original vehicle's metrics by name; NaN where undefined."""
+        metrics = {}
+        for metric in self.scoring.metrics:
+            value = self.original.get(metric.name)
+            metrics[metric.name] = np.nan if value is None else float(value)
+        return metrics
 
     def title_of(self, algorithm: str) -> str:
         """The name of an algorithm for readers."""
@@ -109,8 +136,8 @@ class Case:
 
     def simulated_as(
         self, study: Study, scoring: Scoring, evaluations: Evaluations
-    ) -> Case:
-        """This case with another study, and with results that were simulated in that study.
+    ) -> Results:
+        """These results with another study, and as they were simulated in that study.
 
         Parameters
         ----------
@@ -122,9 +149,9 @@ class Case:
         # The first evaluation is that of the original vehicle.
         returned = evaluations.take(slice(1, None))
         solutions = self.solutions.drop(
-            columns=list(self.original.keys() - evaluations.metrics.keys())
+            columns=list(self.original_metrics.keys() - evaluations.metrics.keys())
         ).assign(f_safe=returned.f_safe, **returned.results)
-        original = {}
+        original = JsonObject()
         for metric in scoring.metrics:
             original[metric.name] = float(evaluations.metrics[metric.name][0])
         return replace(
@@ -143,12 +170,14 @@ class Case:
         """
         if self.stated is None and self.study.unsafe.criterion:
             return Unsafe.parse(self.study.unsafe.criterion)
-        return self.stated or Unsafe.default(self.original, self.solutions["outcome"])
+        return self.stated or Unsafe.default(
+            self.original_metrics, self.solutions["outcome"]
+        )
 
     @property
     def algorithms(self) -> tuple[str, ...]:
         """Labels of the algorithms with solutions or a finished run, in the study's order."""
-        names = {*self.solutions["algorithm"], *dict(self.finished_runs)}
+        names = {*self.solutions["algorithm"], *dict(self.finished)}
         in_order = dict.fromkeys([*self.study.search.labels, *sorted(names)])
         return tuple(name for name in in_order if name in names)
 
@@ -158,14 +187,14 @@ class Case:
         """
         if ORIGINAL_DEGREE in solutions:
             return solutions[ORIGINAL_DEGREE]
-        return pd.Series(self.original[SAFETY_DEGREE], index=solutions.index)
+        return pd.Series(self.original_metrics[SAFETY_DEGREE], index=solutions.index)
 
     @property
     def why_no_solution(self) -> str:
         """The reason for which there is no solution, in words; "" if there are solutions."""
         if len(self.solutions):
             return ""
-        if not self.finished_runs:
+        if not self.finished:
             return "no run is finished"
 
         # A search may return only feasible settings: perhaps no setting is feasible.
@@ -191,7 +220,7 @@ class Case:
         """Refuse results without a solution: raise `UnanswerableError` with the reason."""
         if reason := self.why_no_solution:
             expected = "results with at least one solution"
-            if self.has_runs and not self.finished_runs:
+            if self.has_runs and not self.finished:
                 expected = "at least one finished run: `study` goes on where it was interrupted"
             raise UnanswerableError(self.name, f"has no solution: {reason}", expected)
 
@@ -232,12 +261,12 @@ class Case:
             If the solutions are imported and belong to no run.
         """
         self.require_runs()
-        return sorted(run for name, run in self.finished_runs if name == algorithm)
+        return sorted(run for name, run in self.finished if name == algorithm)
 
     @property
     def run_counts(self) -> Counter[str]:
         """The number of finished runs of each algorithm."""
-        return Counter(algorithm for algorithm, _ in self.finished_runs)
+        return Counter(algorithm for algorithm, _ in self.finished)
 
     @property
     def shortfall(self) -> str:
@@ -260,7 +289,7 @@ class Case:
 
     @property
     def remarks(self) -> list[str]:
-        """Notes for the readers of every table of this case."""
+        """Notes for the readers of every table of these results."""
         remarks = [self.shortfall] if self.shortfall else []
         if not self.has_runs:
             remarks.append(
@@ -277,7 +306,7 @@ class Case:
         return remarks
 
 
-Subject = Study | Case
+Subject = Study | Results
 """The subject of a question: a study, or the results of one."""
 
 
@@ -295,8 +324,8 @@ def are_collisions(solutions: pd.DataFrame) -> pd.Series[bool]:
     return solutions["outcome"] == str(Outcome.COLLISION)
 
 
-def load_cases(directories: Iterable[str | Path]) -> list[Case]:
-    """Read results directories as cases. If several cases have the same name, their names get the
+def load_cases(directories: Iterable[str | Path]) -> list[Results]:
+    """Read directories of results. If several results have the same name, their names get the
     directory in brackets.
 
     Raises
@@ -329,6 +358,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                     solutions,
                     evaluations,
                     finished,
+                    directory=path,
                     has_runs="imported" not in manifest,
                     failures=failures,
                     **facts,
@@ -357,18 +387,14 @@ def build_case(
     finished: Sequence[RunName],
     scoring: Scoring = PUBLISHED_SCORING,
     **facts: Any,
-) -> Case:
-    """Make a case. In `original`, the original vehicle's metrics by name, an undefined metric is
-    None or missing; in the case it is NaN.
+) -> Results:
+    """Make results. In `original`, the original vehicle's metrics by name, an undefined metric is
+    None or missing.
 
     Frames get a column of NaN for each metric and objective that they lack. `facts` are further
-    attributes of `Case`.
+    attributes of `Results`.
     """
-    metrics = {}
-    for metric in scoring.metrics:
-        value = original.get(metric.name)
-        metrics[metric.name] = np.nan if value is None else float(value)
-    names = [*metrics, *(objective.name for objective in scoring.objectives)]
+    names = [measure.name for measure in (*scoring.metrics, *scoring.objectives)]
 
     def with_all_columns(frame: pd.DataFrame) -> pd.DataFrame:
         """The frame with a column of NaN for each metric and objective that it lacks."""
@@ -379,13 +405,13 @@ def build_case(
     evaluations = with_all_columns(evaluations)
     if scoring.safe_original is not None:
         evaluations = evaluations.assign(feasible=scoring.feasible_rows(evaluations))
-    return Case(
+    return Results(
         name=study.name,
         study=study,
-        original=metrics,
+        original=original,
         solutions=solutions,
         evaluations=evaluations,
-        finished_runs=tuple(finished),
+        finished=tuple(finished),
         scoring=scoring,
         **facts,
     )

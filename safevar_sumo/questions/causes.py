@@ -19,7 +19,7 @@ import pandas as pd
 from rich.console import Console
 
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Unsafe
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues
@@ -283,7 +283,7 @@ def count_distinct_causes(
     return pd.DataFrame(rows, columns=["cause", "failures", "share"])
 
 
-def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame:
+def causes_of_runs(case: Results, evaluator: Evaluator, limit: int) -> pd.DataFrame:
     """How many distinct minimal causes each finished run found, in at most `limit` of its unsafe
     solutions: those with the fewest, then the smallest changes.
 
@@ -322,7 +322,7 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     }
     frame = pd.DataFrame(
         {name: rows.groupby(keys).size() for name, rows in counted.items()},
-        pd.MultiIndex.from_tuples(case.finished_runs, names=keys),
+        pd.MultiIndex.from_tuples(case.finished, names=keys),
     )
     return frame.fillna(0).astype(int).reset_index()
 

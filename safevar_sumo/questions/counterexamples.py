@@ -13,7 +13,7 @@ import numpy as np
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.metrics.words import runs_in_words
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.causes import find_minimal_causes
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
@@ -148,7 +148,7 @@ def values_as_printed(
     ]
 
 
-def solution_with_fewest_changes(case: Case) -> FloatArray | None:
+def solution_with_fewest_changes(case: Results) -> FloatArray | None:
     """The unsafe solution with the fewest changes, shape (n,), as a search returned it. None if no
     solution is unsafe.
     """
@@ -160,7 +160,7 @@ def solution_with_fewest_changes(case: Case) -> FloatArray | None:
     return setting
 
 
-def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
+def fewest_changes(case: Results, jobs: int | None = None) -> Evaluations | None:
     """The evaluation of the smallest minimal cause of the unsafe solution with the fewest changes.
     Its values are rounded as they are printed. None if no solution is unsafe, or if the solution is
     safe in this simulation, or (if runs differ) in all fresh runs.

@@ -36,7 +36,7 @@ from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, Unsafe
 from safevar_sumo.questions.between import in_phases
 from safevar_sumo.questions.budget import QUICK_EFFORTS, QUICK_SECONDS, Budget
-from safevar_sumo.questions.case import Case, Subject
+from safevar_sumo.questions.case import Results, Subject
 from safevar_sumo.questions.price import (
     MEASURED,
     print_price_of_list,
@@ -491,7 +491,7 @@ class Evaluator:
             )
         return evaluations
 
-    def refuse_other_original(self, case: Case) -> None:
+    def refuse_other_original(self, case: Results) -> None:
         """Refuse results if the simulator drives the original vehicle in another way now. Without
         deterministic runs at all points this cannot be compared, and nothing is refused.
         """
@@ -502,7 +502,9 @@ class Evaluator:
             jobs = [(Task(study=study), self.characteristics.original_settings)]
             self.budget.spend(self._each)
             (evaluations,) = carry_out(evaluate_settings, jobs, self._pool)
-            refuse_other_original(Path(case.name), case.original, record(evaluations))
+            refuse_other_original(
+                Path(case.name), case.original_metrics, record(evaluations)
+            )
 
     @cached_property
     def no_verdict(self) -> str:

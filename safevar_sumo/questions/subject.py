@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
-from functools import cached_property
-from html import escape
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +11,8 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.questions.arguments import checked
-from safevar_sumo.records import JsonObject
 from safevar_sumo.results import (
     MANIFEST,
-    RunName,
     manifest_differences,
     read_manifest,
 )
@@ -25,72 +21,10 @@ from safevar_sumo.study import Study, StudyLike, study_names
 from safevar_sumo.study.file import ENDED_STUDIES
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from safevar_sumo.questions.case import Case, Subject
+    from safevar_sumo.questions.case import Results, Subject
 
 MAX_CHANGES_NAMED = 3
 """Maximum number of changed inputs that an error names."""
-
-
-@dataclass(frozen=True)
-class Results:
-    """Contents of a results directory; its runs may be unfinished.
-
-    Attributes
-    ----------
-    directory
-        The directory.
-    case
-        Study, solutions and evaluations, from which the research questions are answered.
-    """
-
-    directory: Path
-    case: Case
-
-    @property
-    def study(self) -> Study:
-        """The study as it was run."""
-        return self.case.study
-
-    @cached_property
-    def original(self) -> JsonObject:
-        """The original vehicle's outcome, metrics and objectives as plain values, None where
-        undefined.
-        """
-        return JsonObject(read_manifest(self.directory)["original"])
-
-    @property
-    def solutions(self) -> pd.DataFrame:
-        """One row per solution of every finished run.
-
-        Columns: algorithm, run (absent from imported results), the characteristics in their table
-        units, f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN
-        where undefined), outcome.
-        """
-        return self.case.solutions
-
-    @property
-    def evaluations(self) -> pd.DataFrame:
-        """One row per simulated setting of every run, in the order of the run's requests; same
-        columns as `solutions`. If encounters are ranges, `feasible` is true where the
-        original vehicle is safe in the same encounter: only these count.
-        """
-        return self.case.evaluations
-
-    @property
-    def finished(self) -> tuple[RunName, ...]:
-        """Algorithm and number of every finished run."""
-        return self.case.finished_runs
-
-    def _repr_html_(self) -> str:
-        return f"<p>{escape(repr(self))}</p>\n{self.solutions.to_html(max_rows=10, index=False)}"
-
-    def __repr__(self) -> str:
-        return (
-            f"<Results of {self.case.name} in {self.directory}: {len(self.finished)} runs,"
-            f" {len(self.solutions)} solutions>"
-        )
 
 
 @checked
@@ -109,7 +43,7 @@ def load(directory: str | Path) -> Results:
     """
     from safevar_sumo.questions.case import load_cases
 
-    return Results(Path(directory), load_cases([directory])[0])
+    return load_cases([directory])[0]
 
 
 def study_or_case(
@@ -118,7 +52,7 @@ def study_or_case(
     as_it_is_now: bool = False,
     results_only: bool = False,
 ) -> Subject:
-    """The subject of a question: a study, or the case of results; `source` may be a name or a path.
+    """The subject of a question: a study, or results; `source` may be a name or a path.
 
     With `results_only`, a name or path means a directory, even if a study has the same name.
 
@@ -134,6 +68,8 @@ def study_or_case(
         If `source` is no study and no results, if an input of the results has changed, or if
         `as_it_is_now` is set for a study.
     """
+    from safevar_sumo.questions.case import Results
+
     if isinstance(source, str | Path):
         # A text that is no legal path must give an error of its own: `os.path` accepts any text.
         names = study_names()
@@ -159,11 +95,12 @@ def study_or_case(
                 f" written, or {one_of(names)}",
             )
     if isinstance(source, Results):
-        for change in changes_since(
-            source.directory, source.case, as_it_is_now=as_it_is_now
-        ):
-            warn(f"{source.directory}: {change}")
-        return source.case
+        if source.directory is not None:
+            for change in changes_since(
+                source.directory, source, as_it_is_now=as_it_is_now
+            ):
+                warn(f"{source.directory}: {change}")
+        return source
     if as_it_is_now:
         raise InputError(
             "as_it_is_now",
@@ -219,7 +156,7 @@ def with_own_set(subject: Subject) -> Any:
     return replace(subject, study=study)
 
 
-def case_at(case: Case, point: str) -> Case:
+def case_at(case: Results, point: str) -> Results:
     """Results at a test or point of the study's matrix alone: the solutions and the original
     vehicle are simulated again there.
 
@@ -240,7 +177,7 @@ def case_at(case: Case, point: str) -> Case:
     )
 
 
-def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[str]:
+def changes_since(directory: Path, case: Results, *, as_it_is_now: bool) -> list[str]:
     """The inputs that have changed since the results were computed, each in a sentence. Imported
     results record no inputs: then there are no changes.
 

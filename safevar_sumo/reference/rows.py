@@ -19,7 +19,8 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import read_file
 from safevar_sumo.questions.arguments import checked
-from safevar_sumo.questions.subject import Results, load
+from safevar_sumo.questions.case import Results
+from safevar_sumo.questions.subject import load
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome, nans
 from safevar_sumo.results import UNKNOWN, write_imported
 from safevar_sumo.scenarios.declared import read_study

@@ -31,7 +31,7 @@ from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import SIMULATIONS, Question
 from safevar_sumo.questions.by_criterion import cases_by
-from safevar_sumo.questions.case import Case, build_case
+from safevar_sumo.questions.case import Results, build_case
 from safevar_sumo.questions.options import flag_of
 from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.tables import shipped_columns
@@ -255,7 +255,7 @@ class Packed:
                 )
 
     @cached_property
-    def judged_case(self) -> Case:
+    def judged_case(self) -> Results:
         """The results by the criterion of the pack. Raises an InputError if the manifest states
         another scoring than that of the study.
         """
@@ -372,7 +372,7 @@ class Packed:
                 only=self.packed.runs,
             )
             return Recomputed(
-                json_bytes(count_outcomes(results.case)), csv_of(results.solutions)
+                json_bytes(count_outcomes(results)), csv_of(results.solutions)
             )
 
     @property
@@ -477,10 +477,10 @@ def csv_of(frame: pd.DataFrame) -> bytes:
     return csv_text(frame).encode()
 
 
-def count_outcomes(case: Case) -> dict[str, int]:
+def count_outcomes(case: Results) -> dict[str, int]:
     """The number of evaluations of all finished runs, by outcome."""
     runs = pd.MultiIndex.from_frame(case.evaluations[["algorithm", "run"]])
-    outcomes = case.evaluations["outcome"][runs.isin(case.finished_runs)]
+    outcomes = case.evaluations["outcome"][runs.isin(case.finished)]
     counts: dict[Any, int] = outcomes.value_counts().sort_index().to_dict()
     return counts
 

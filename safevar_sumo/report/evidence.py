@@ -27,7 +27,7 @@ from safevar_sumo.plugins import (
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import SIMULATIONS, Criterion
 from safevar_sumo.questions.by_criterion import cases_by
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.options import Cluster, Jobs, Simulations
 from safevar_sumo.questions.permit.fleet import list_without_names
 from safevar_sumo.questions.sentence import Verdict, answer
@@ -175,7 +175,7 @@ def _pack_study(
     study's files by name.
     """
     case = study_or_case(directory, results_only=True)
-    assert isinstance(case, Case)
+    assert isinstance(case, Results)
     if not case.has_runs:
         raise InputError(
             directory,
@@ -194,7 +194,7 @@ def _pack_study(
     (judged,) = cases_by([case], unsafe, progress=show_no_progress, **workers)
     questions, lists = _with_lists(list(dict.fromkeys(ask or usual_questions(judged))))
     folder = f"{number}-{study.name}"
-    runs = list(case.finished_runs)
+    runs = list(case.finished)
     (parts,) = parts_of_simulations(
         [case], [judged], None, [with_speed_part(questions, case)], simulations
     )

@@ -26,7 +26,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.ask import SIMULATIONS, Question
 from safevar_sumo.questions.by_criterion import cases_by
-from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.case import Results, load_cases
 from safevar_sumo.questions.figures import own_style
 from safevar_sumo.questions.options import (
     CRITERION,
@@ -35,7 +35,7 @@ from safevar_sumo.questions.options import (
     PointName,
     Simulations,
 )
-from safevar_sumo.questions.subject import Results, case_at, changes_since, with_own_set
+from safevar_sumo.questions.subject import case_at, changes_since, with_own_set
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.budget import REPLAYS, SPEED, divided
@@ -252,8 +252,8 @@ def report(
 
 
 def _cases_asked_about(
-    cases: Sequence[Case], point: str | None, *, quick: bool
-) -> list[Case]:
+    cases: Sequence[Results], point: str | None, *, quick: bool
+) -> list[Results]:
     """The results about which the page asks: at a `point` if there is one, and only with the
     study's own parameter set if the page is `quick`.
     """
@@ -265,8 +265,8 @@ def _cases_asked_about(
 
 
 def parts_of_simulations(
-    point_cases: Sequence[Case],
-    criterion_cases: Sequence[Case],
+    point_cases: Sequence[Results],
+    criterion_cases: Sequence[Results],
     point: str | None,
     texts_of: Sequence[Sequence[str]],
     simulations: int | None,
@@ -295,7 +295,7 @@ def parts_of_simulations(
 
 def _pool_of(
     stack: ExitStack,
-    cases: Sequence[Case],
+    cases: Sequence[Results],
     jobs: int | None,
     cluster: str | None,
     is_limited: bool,
@@ -313,7 +313,7 @@ def _pool_of(
     return pool
 
 
-def with_speed_part(questions: Sequence[str], case: Case) -> list[str]:
+def with_speed_part(questions: Sequence[str], case: Results) -> list[str]:
     """The questions about results, and `SPEED` if the page has a sheet that states the greatest
     speed.
     """
@@ -334,7 +334,7 @@ def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
 
 
 def _later_changes(
-    paths: Sequence[Path], cases: Sequence[Case], *, as_it_is_now: bool
+    paths: Sequence[Path], cases: Sequence[Results], *, as_it_is_now: bool
 ) -> list[list[str]]:
     """The changes of files and versions since each of the results were computed. The user is warned
     of each change.
@@ -348,7 +348,7 @@ def _later_changes(
     return later_changes
 
 
-def usual_questions(case: Case) -> list[str]:
+def usual_questions(case: Results) -> list[str]:
     """The questions of a page about results, unless the user asks others. The question about the
     smallest changes is left out with a simulator that takes long.
     """

@@ -17,7 +17,7 @@ from safevar_sumo.questions.answer import (
     Answer,
     tabulate,
 )
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.catalogue import description_of
 from safevar_sumo.questions.explain.failures import REASONS
 from safevar_sumo.questions.model_spread import compute_model_spreads
@@ -89,7 +89,7 @@ class ReportedStudy:
     """
 
     directory: Path
-    case: Case
+    case: Results
     versions: Mapping[str, str]
     answers: Sequence[Answer] = ()
     point: str = ""
@@ -273,7 +273,10 @@ def trust(study: ReportedStudy) -> Answer:
     if case.study.spread:
         settings = np.vstack([case.characteristics.original, study.chosen_settings])
         spreads = compute_model_spreads(case.study, settings, study.point)
-        degrees = [case.original[SAFETY_DEGREE], *study.chosen_solutions["f_safe"]]
+        degrees = [
+            case.original_metrics[SAFETY_DEGREE],
+            *study.chosen_solutions["f_safe"],
+        ]
         rows = [
             {
                 "vehicle": name,
@@ -293,7 +296,7 @@ def trust(study: ReportedStudy) -> Answer:
     # The quotient is safe: a study refuses a published value of 0.
     published = []
     for name, value in case.study.published.items():
-        metric = case.original.get(name, math.nan)
+        metric = case.original_metrics.get(name, math.nan)
         if not math.isnan(metric):
             published.append(
                 {

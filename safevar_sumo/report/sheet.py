@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Columns, tabulate
 from safevar_sumo.questions.ask import QUICK, find_question
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.tables import html_table
 from safevar_sumo.questions.words import join_phrases, undecidable_in_words
@@ -198,7 +198,7 @@ def _records(frame: pd.DataFrame) -> list[dict[Any, Any]]:
     return frame.to_dict("records")
 
 
-def speeds_of(case: Case) -> Span | None:
+def speeds_of(case: Results) -> Span | None:
     """The range of speeds of a study; None if the study varies no speed."""
     try:
         return span_of(case.study, None)
@@ -236,7 +236,7 @@ def _greatest_speed(
     )
 
 
-def _is_relative(case: Case, unsafe: Unsafe) -> bool:
+def _is_relative(case: Results, unsafe: Unsafe) -> bool:
     """Whether a criterion compares vehicles with the original vehicle: the default criterion does
     so if no vehicle collides.
     """

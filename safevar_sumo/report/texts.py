@@ -15,7 +15,7 @@ from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import QUICK, SIMULATIONS, Question, find_question
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.options import CRITERION
 from safevar_sumo.records import JsonObject
 from safevar_sumo.terminal import Progress
@@ -93,7 +93,7 @@ def completed(
 def answer_about(  # noqa: PLR0913 - options of the command `report`
     question: Question,
     values: JsonObject,
-    cases: Sequence[Case],
+    cases: Sequence[Results],
     directories: Sequence[Path],
     point: str | None,
     jobs: int | None,

@@ -114,7 +114,7 @@ def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
         studied["verdict"],
     )
     results = sv.load("results")
-    solutions = results.solutions.drop_duplicates([*results.case.characteristics.names])
+    solutions = results.solutions.drop_duplicates([*results.characteristics.names])
     assert (
         0
         < int(counts[1])

@@ -10,7 +10,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.case import Results, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from tests.support.in_process import InlinePool, searched, write
 
@@ -49,7 +49,7 @@ def test_a_simulator_that_drives_the_original_otherwise_now_is_refused(
     noisy = replace_in(study, scenario=replace_in(study.scenario, repeats=2))
     at_point = replace_in(study, origin=replace_in(study.origin, point="a"))
 
-    def compare(with_study: Case) -> None:
+    def compare(with_study: Results) -> None:
         evaluator = Evaluator(with_study.study, InlinePool())
         evaluator.refuse_other_original(with_study)
 

@@ -15,7 +15,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import evaluator
 from safevar_sumo.questions.bench import bench_of
-from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.case import Results, load_cases
 from safevar_sumo.questions.cases import SearchPlan, search_scope
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
@@ -84,7 +84,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def case(folder: Path) -> Case:
+def case(folder: Path) -> Results:
     return load_cases([folder / "results"])[0]
 
 
@@ -113,7 +113,7 @@ def test_results_are_asked_about_in_the_encounters_of_their_study() -> None:
 
 
 def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_same_encounter(
-    case: Case,
+    case: Results,
 ) -> None:
     drawn = case.evaluations
     limit = case.scoring.safe_original
@@ -141,7 +141,7 @@ def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_s
 
 
 def test_the_margin_of_the_original_is_a_key_and_says_which_evaluations_are_feasible(
-    case: Case,
+    case: Results,
 ) -> None:
     assert case.scoring.safe_original == 0.4
     frame = case.evaluations
@@ -248,7 +248,7 @@ def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
     assert met.simulated <= 5000
 
 
-def test_changes_are_those_of_the_vehicle(case: Case) -> None:
+def test_changes_are_those_of_the_vehicle(case: Results) -> None:
     tables = json_of("tables results")["tables"]
     solutions = case.solutions[case.solutions["algorithm"] == "nsga2"]
     critical = solutions[

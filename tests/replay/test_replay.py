@@ -21,7 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image, ImageSequence
 
 from safevar_sumo.api.simulation import simulate
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.replay import animation, gui
 from safevar_sumo.replay.animation import (
     FRAME_DPI,
@@ -44,7 +44,7 @@ from tests.support.in_process import SLOW
 from tests.support.needs import need_program
 
 
-def test_a_replay_that_differs_from_its_row_is_reported(case: Case) -> None:
+def test_a_replay_that_differs_from_its_row_is_reported(case: Results) -> None:
     comparison = comparison_of(simulate(case.study))
     result = list_differences(
         comparison.evaluations,
@@ -58,7 +58,7 @@ def test_a_replay_that_differs_from_its_row_is_reported(case: Case) -> None:
 
 
 @pytest.fixture(scope="module")
-def comparison(case: Case) -> Comparison:
+def comparison(case: Results) -> Comparison:
     settings = case.solutions[list(case.characteristics.names)]
     return comparison_of(simulate(case.study, settings.iloc[0]))
 

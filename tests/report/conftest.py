@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from safevar_sumo.campaign import local
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from tests.support.made_up_studies import Plant
 from tests.support.report_pages import ASK, page_of
 
 
 @pytest.fixture(scope="session")
-def page(slippery: Path, case: Case) -> str:
+def page(slippery: Path, case: Results) -> str:
     """The whole page; of the domain it asks a formula: tyre frictions from 1 to 1.5 collide, of 1
     to 3.9.
     """

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from safevar_sumo.api.simulation import simulate
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.replay.animation import PLAYER_FOLDER, animate
 from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.report.page import TEMPLATE_FOLDER
@@ -125,7 +125,7 @@ def try_player(browser: Chrome, player: WebElement) -> None:
 
 @SLOW
 def test_an_animation_plays_and_scrubs_as_a_file(
-    browser: Chrome, case: Case, tmp_path: Path
+    browser: Chrome, case: Results, tmp_path: Path
 ) -> None:
     settings = case.solutions[list(case.characteristics.names)]
     simulation = simulate(case.study, settings.iloc[0])

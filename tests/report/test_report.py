@@ -25,7 +25,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.ads.reference_drivers import FullBraking
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.case import Results, load_cases
 from safevar_sumo.questions.figures import new_figure
 from safevar_sumo.report import replays, sections
 from safevar_sumo.report.page import _picture, usual_questions
@@ -130,7 +130,7 @@ def test_what_decides_leads_with_a_replay_and_the_rest_is_folded(page: str) -> N
 
 @SLOW
 def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(
-    page: str, case: Case
+    page: str, case: Results
 ) -> None:
     shown = r'<details class="replay".*?<summary>(.*?)</summary>.*?<img alt="(.*?)"'
     players = re.findall(shown, page, re.DOTALL)
@@ -158,7 +158,7 @@ def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(
 
 @SLOW
 def test_settings_that_answers_name_are_replayed_once_for_each_set_of_changes(
-    case: Case, slippery: Path
+    case: Results, slippery: Path
 ) -> None:
     changes = [
         {"tireFric": 1.2},
@@ -222,7 +222,7 @@ def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(
 
 
 def test_a_question_without_an_answer_has_the_reason(
-    case: Case, slippery: Path
+    case: Results, slippery: Path
 ) -> None:
     arguments = *parse_question("repair"), [case], [slippery], None, 1, show_no_progress
     assert answer_about(*arguments, is_asked=False).verdict.startswith("No answer: ")
@@ -241,7 +241,7 @@ def test_the_sentence_about_a_model_is_whole() -> None:
     )
 
 
-def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> None:
+def test_the_usual_questions_are_those_that_a_study_can_answer(case: Results) -> None:
     usual = usual_questions(case)
     assert usual.pop(1) == "explain --of-study"
     assert [text.partition(" ")[0] for text in usual] == [

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.case import Results, load_cases
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import (
     ResultsDirectory,
@@ -433,7 +433,7 @@ def status_of(place: Path) -> dict[str, dict[str, Any]]:
 
 
 def test_the_status_of_a_study_agrees_with_its_journals(
-    slippery: Path, case: Case
+    slippery: Path, case: Results
 ) -> None:
     before = contents(slippery)
     status = status_of(slippery)

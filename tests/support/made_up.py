@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions.case import Case, build_case
+from safevar_sumo.questions.case import Results, build_case
 from safevar_sumo.records import (
     Encounter,
     Evaluations,
@@ -50,7 +50,7 @@ HARDEST = Measure(
 """The file of a user's metric, the hardest braking [m/s^2], undefined in a collision."""
 
 
-def case_of(study: Study, original: Evaluations, solutions: Evaluations) -> Case:
+def case_of(study: Study, original: Evaluations, solutions: Evaluations) -> Results:
     """A case of one run of NSGA-II with these solutions, without evaluations."""
     frame = solutions_frame(
         CharacteristicSet.of(study).names, [(("nsga2", 0), solutions)]

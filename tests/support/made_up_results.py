@@ -11,7 +11,7 @@ import pandas as pd
 from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions.case import Case, build_case
+from safevar_sumo.questions.case import Results, build_case
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import CharacteristicTable, Study
 
@@ -91,7 +91,7 @@ def made_up(
     evaluations: Sequence[Mapping[str, Any]] = (),
     finished: Sequence[tuple[str, int]] | None = None,
     has_runs: bool = True,
-) -> Case:
+) -> Results:
     """A case with these solutions; unless `finished` is given, the finished runs are those with a
     solution.
     """
@@ -115,7 +115,7 @@ def made_up(
 RUNS = 12
 
 
-def three_algorithms() -> Case:
+def three_algorithms() -> Results:
     """The second finds more severe solutions than the first, the third as the first; run 3 of the
     third finds none.
     """

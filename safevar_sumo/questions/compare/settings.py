@@ -14,7 +14,7 @@ import pandas as pd
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, about
-from safevar_sumo.questions.case import Case, Subject
+from safevar_sumo.questions.case import Results, Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.pairs import Criteria, Runs
 from safevar_sumo.questions.sampling import Interval, sobol_points
@@ -227,7 +227,7 @@ def pairs_of(
     outside = 0
 
     for side, case in zip("ab", subjects, strict=True):
-        if not isinstance(case, Case):
+        if not isinstance(case, Results):
             continue
         solutions = case.solutions[names].to_numpy(float)
         in_a = solutions if side == "a" else solutions - common.shift

@@ -13,7 +13,7 @@ import pandas as pd
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.budget import LEAST_SETTINGS
-from safevar_sumo.questions.case import Case, Subject, are_collisions
+from safevar_sumo.questions.case import Results, Subject, are_collisions
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
     OTHER_SETS,
@@ -273,7 +273,7 @@ def _counts(
         by_set = over_sets.numbers(failures / max(len(runs), 1))
     omissions = 0
     if (
-        isinstance(subject, Case)
+        isinstance(subject, Results)
         and not subject.study.origin.point
         and not runs.collided.any()
     ):

@@ -14,7 +14,7 @@ from numpy.random import default_rng
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.case import Case, Subject
+from safevar_sumo.questions.case import Results, Subject
 from safevar_sumo.questions.causes import (
     Cause,
     count_distinct_causes,
@@ -186,7 +186,7 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> Candidates:
     return settings, names, np.full(len(settings), UNKNOWN)
 
 
-def _solutions_of(case: Case, named: Sequence[SolutionId]) -> Candidates:
+def _solutions_of(case: Results, named: Sequence[SolutionId]) -> Candidates:
     """The different solutions of results. The solutions that the user names come first."""
     table = case.solutions
     characteristics = list(case.characteristics.names)

@@ -17,7 +17,7 @@ from safevar_sumo.questions.answer import Answer, Columns, contents, tabulate
 from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.case import (
     NSGA2,
-    Case,
+    Results,
     UnanswerableError,
     are_collisions,
     load_cases,
@@ -57,8 +57,6 @@ from safevar_sumo.terminal import open_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from safevar_sumo.questions.subject import Results
 
 REMARKS: Columns = {
     "table": "table",
@@ -189,7 +187,7 @@ def _directories_of(results: Sequence[Results | str | Path]) -> list[Any]:
     return [getattr(source, "directory", source) for source in results]
 
 
-def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
+def _causes_of_runs(case: Results, limit: int, jobs: int | None) -> pd.DataFrame:
     """The numbers of minimal causes of a case's runs. Up to `limit` unsafe solutions of each run
     are reduced to their causes by simulation.
     """
@@ -204,7 +202,7 @@ def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
 
 
 def answer_questions(
-    cases: Sequence[Case],
+    cases: Sequence[Results],
     choices: Choices = DEFAULT,
     names: Collection[str] = FUNCTIONS,
 ) -> Answer:
@@ -275,7 +273,7 @@ def answer_questions(
     )
 
 
-def _verdict(case: Case) -> Sentences:
+def _verdict(case: Results) -> Sentences:
     """Say how many solutions of a case collide, and how many solutions of NSGA-II are critical
     (less safe than the original vehicle).
     """
@@ -303,7 +301,7 @@ def _verdict(case: Case) -> Sentences:
     yield from map(note, demanded_in_words(case.study))
 
 
-def _equal_solutions(case: Case) -> str:
+def _equal_solutions(case: Results) -> str:
     """A sentence that says how many solutions equal an earlier solution of the same run; "" if no
     solutions are equal. Tables of pooled solutions count all of them.
     """
@@ -319,7 +317,7 @@ def _equal_solutions(case: Case) -> str:
 
 
 def _remarks(
-    table: str, case: Case, frame: pd.DataFrame, alpha: float
+    table: str, case: Results, frame: pd.DataFrame, alpha: float
 ) -> Iterator[str]:
     """Yield the remarks on a table of a case: what the table leaves out, and how it was tested."""
     remarks = list[str]()
@@ -345,7 +343,7 @@ def _remarks(
 
 
 def _on_pooled_tests(
-    table: str, case: Case, frame: pd.DataFrame, alpha: float
+    table: str, case: Results, frame: pd.DataFrame, alpha: float
 ) -> Iterator[str]:
     """Yield remarks on the tests of pooled solutions: algorithms with too few runs, metrics that
     are undefined in some solutions, and the numbers of simulations.
@@ -368,7 +366,7 @@ def _on_pooled_tests(
                 " leave these out."
             )
     if table == "rq1":
-        values = pd.Series(case.original, dtype=float)
+        values = pd.Series(case.original_metrics, dtype=float)
         # If encounters are ranges, only the original's safety degree is known in the encounters of
         # the solutions.
         if case.study.ranges:

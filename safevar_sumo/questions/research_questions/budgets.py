@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.research_questions.comparisons import (
     Choices,
     rq2_runs,
@@ -48,7 +48,7 @@ POWER = 0.8
 """Probability with which a planned number of runs shows an effect."""
 
 
-def within_budgets(case: Case) -> pd.DataFrame:
+def within_budgets(case: Results) -> pd.DataFrame:
     """All settings that the finished runs of a case might return. A setting has a row for each
     budget in which it was simulated. The column `simulations` is the budget: one of `BUDGETS`, or
     the whole budget of a run.
@@ -70,7 +70,7 @@ def within_budgets(case: Case) -> pd.DataFrame:
     return pd.concat(parts)
 
 
-def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
+def compare_budgets(case: Results, choices: Choices) -> pd.DataFrame:
     """Compare every pair of algorithms within each budget.
 
     `effect_size` is A12 of the hypervolume of the runs, above 0.5 if the algorithm is better.

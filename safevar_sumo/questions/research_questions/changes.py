@@ -13,7 +13,12 @@ from itertools import compress, product
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions
+from safevar_sumo.questions.case import (
+    NSGA2,
+    Results,
+    UnanswerableError,
+    are_collisions,
+)
 from safevar_sumo.records import FloatArray, TextArray
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -33,7 +38,7 @@ quantities with a percentage are in it.
 """
 
 
-def critical_solutions(case: Case) -> pd.DataFrame:
+def critical_solutions(case: Results) -> pd.DataFrame:
     """The critical solutions: NSGA-II's solutions with a safety degree below the original's.
 
     Raises
@@ -42,7 +47,7 @@ def critical_solutions(case: Case) -> pd.DataFrame:
         If NSGA-II has no finished run, or the original's safety degree is undefined.
     """
     solutions = case.solutions_of(NSGA2)
-    if np.isnan(case.original[SAFETY_DEGREE]):
+    if np.isnan(case.original_metrics[SAFETY_DEGREE]):
         raise UnanswerableError(
             case.name,
             "lacks the original vehicle's safety degree",
@@ -51,7 +56,7 @@ def critical_solutions(case: Case) -> pd.DataFrame:
     return solutions[solutions[SAFETY_DEGREE] < case.original_degrees(solutions)]
 
 
-def changes_of(case: Case) -> FloatArray:
+def changes_of(case: Results) -> FloatArray:
     """The changes of the vehicle's n characteristics in the M critical solutions, in their units,
     shape (M, n). A change is the filtered value minus the original value, the paper's v'' - v.
     """
@@ -60,12 +65,12 @@ def changes_of(case: Case) -> FloatArray:
     return values - vehicle.original
 
 
-def change_numbers(case: Case) -> list[str]:
+def change_numbers(case: Results) -> list[str]:
     """All possible numbers of changed characteristics, as texts: "1".."n"."""
     return list(map(str, range(1, len(case.characteristics.vehicle) + 1)))
 
 
-def count_changes(case: Case) -> TextArray:
+def count_changes(case: Results) -> TextArray:
     """The number j of changed characteristics of each of the M critical solutions, as texts, shape
     (M,).
     """
@@ -74,7 +79,7 @@ def count_changes(case: Case) -> TextArray:
 
 
 def _means_by_change_count(
-    case: Case,
+    case: Results,
     labels: Sequence[str],
     name: str,
     values: Iterable[tuple[tuple[str, ...], FloatArray]],
@@ -95,7 +100,7 @@ def _means_by_change_count(
     return pd.DataFrame(rows, columns=[*labels, "j", name, "n"])
 
 
-def rq31(case: Case) -> pd.DataFrame:
+def rq31(case: Results) -> pd.DataFrame:
     """Number of critical solutions of each run with exactly j characteristics changed; columns run,
     j, count.
     """
@@ -106,7 +111,7 @@ def rq31(case: Case) -> pd.DataFrame:
     return counts.reindex(index, fill_value=0).reset_index(name="count")
 
 
-def rq32(case: Case) -> pd.DataFrame:
+def rq32(case: Results) -> pd.DataFrame:
     """For each characteristic and j: the share of the critical solutions with j changes that change
     this characteristic.
 
@@ -124,7 +129,7 @@ def rq32(case: Case) -> pd.DataFrame:
     return frame.assign(rank=ranks.astype("Int64"))
 
 
-def rq33(case: Case) -> pd.DataFrame:
+def rq33(case: Results) -> pd.DataFrame:
     """Size of increases and of decreases in the critical solutions with j characteristics changed.
 
     Columns characteristic, direction, j ("1".."n", "any"), pc (the paper's PC, a fraction: mean
@@ -145,7 +150,7 @@ def rq33(case: Case) -> pd.DataFrame:
     return frame
 
 
-def rq33_safety(case: Case) -> pd.DataFrame:
+def rq33_safety(case: Results) -> pd.DataFrame:
     """Effect on safety of the critical solutions with j characteristics changed: the footer of
     RQ3.3's table.
 
@@ -167,7 +172,7 @@ def rq33_safety(case: Case) -> pd.DataFrame:
         solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(float).T
     )
     degrees = case.original_degrees(solutions)
-    original = case.original
+    original = case.original_metrics
     if case.study.ranges:
         original = {**dict.fromkeys(original, np.nan), SAFETY_DEGREE: degrees.mean()}
 
@@ -186,7 +191,7 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     return frame
 
 
-def count_collisions(case: Case) -> pd.DataFrame:
+def count_collisions(case: Results) -> pd.DataFrame:
     """Number of collisions among each algorithm's solutions; columns algorithm, solutions,
     collisions, share [fraction].
 
@@ -204,7 +209,7 @@ def count_collisions(case: Case) -> pd.DataFrame:
     return counts.rename_axis("algorithm").reset_index()
 
 
-def frequent_combinations(case: Case) -> pd.DataFrame:
+def frequent_combinations(case: Results) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics
     changed.
 

@@ -29,7 +29,7 @@ from safevar_sumo.metrics import Measure
 from safevar_sumo.questions.answer import JsonRows
 from safevar_sumo.questions.case import (
     NSGA2,
-    Case,
+    Results,
     UnanswerableError,
     solutions_for_metric,
 )
@@ -85,7 +85,7 @@ class Choices(NamedTuple):
 DEFAULT = Choices()
 
 
-def rq1(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+def rq1(case: Results, choices: Choices = DEFAULT) -> pd.DataFrame:
     """Compare, for each metric, every algorithm's pooled solutions with the original's value, which
     is repeated once for each solution.
 
@@ -96,7 +96,7 @@ def rq1(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     return _with_significance(pd.DataFrame(_test_original(case, choices)), choices)
 
 
-def rq2(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+def rq2(case: Results, choices: Choices = DEFAULT) -> pd.DataFrame:
     """Compare an algorithm, which `opponents_of` chooses, with every other algorithm (baseline).
     Compared are the quality indicators of runs and the metrics of pooled solutions.
 
@@ -116,7 +116,7 @@ def rq2(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     return _with_significance(frame, choices)
 
 
-def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+def rq1_runs(case: Results, choices: Choices = DEFAULT) -> pd.DataFrame:
     """Compare, for each metric, the means of every algorithm's runs with the original's value by
     Wilcoxon's signed-rank test.
 
@@ -130,7 +130,7 @@ def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def rq2_runs(
-    case: Case, choices: Choices = DEFAULT, further: Samples | None = None
+    case: Results, choices: Choices = DEFAULT, further: Samples | None = None
 ) -> pd.DataFrame:
     """Compare an algorithm with every other algorithm by the Mann-Whitney U test, with one value
     for each run. The values are quality indicators, means of metrics over solutions and, if they
@@ -145,7 +145,7 @@ def rq2_runs(
     return tests[tests.index == "RQ2"]
 
 
-def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+def rq2_common(case: Results, choices: Choices = DEFAULT) -> pd.DataFrame:
     """The tests of `rq2_runs`, but with one rule for the solutions of a run, whatever the
     algorithm: all evaluations that no other evaluation of the run dominates. A further test
     compares the best safety degree of a run.
@@ -159,15 +159,13 @@ def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     valid = valid_evaluations(case, case.evaluations)
     best = valid.groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
     # A run without valid evaluations counts as the worst run.
-    best = best.reindex(
-        pd.MultiIndex.from_tuples(case.finished_runs), fill_value=math.inf
-    )
+    best = best.reindex(pd.MultiIndex.from_tuples(case.finished), fill_value=math.inf)
     further = {(name, BEST): best[name] for name in case.algorithms}
     # The causes were counted among the solutions that the algorithms returned.
     return rq2_runs(common, choices._replace(causes={}), further)
 
 
-def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+def effects(case: Results, choices: Choices = DEFAULT) -> pd.DataFrame:
     """`rq2_runs` in short, for a paper: with a column a12, the effect size with marks."""
     tests = rq2_runs(case, choices)
     texts = []
@@ -182,7 +180,7 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def compare_over_runs(
-    case: Case, choices: Choices, further: Samples | None = None
+    case: Results, choices: Choices, further: Samples | None = None
 ) -> pd.DataFrame:
     """Every test of RQ1 over runs and, if there are two algorithms, every test of RQ2, which also
     compares the `further` samples. The index is the question, RQ1 or RQ2.
@@ -234,7 +232,7 @@ def with_intervals(tests: pd.DataFrame, alpha: float) -> pd.DataFrame:
     return tests.assign(effect_size_low=low, effect_size_high=high)
 
 
-def medians_over_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+def medians_over_runs(case: Results, choices: Choices = DEFAULT) -> pd.DataFrame:
     """The medians, with intervals, of every indicator and metric over the runs of each algorithm.
     The columns are algorithm, metric, runs, median, median_low and median_high.
     """
@@ -250,7 +248,7 @@ def medians_over_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     )
 
 
-def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
+def minimal_causes(case: Results, choices: Choices) -> pd.DataFrame:
     """The numbers of distinct minimal causes that the runs found, as `Choices.causes` holds them.
 
     Raises
@@ -268,7 +266,7 @@ def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
     return choices.causes[case.name]
 
 
-def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
+def opponents_of(case: Results, algorithm: str) -> tuple[str, list[str]]:
     """The algorithm that RQ2 compares, and all other algorithms. The default is NSGA-II, else the
     study's first algorithm with results.
 
@@ -296,7 +294,7 @@ def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
 
 
 def _test_original(
-    case: Case, choices: Choices, *, over_runs: bool = False
+    case: Results, choices: Choices, *, over_runs: bool = False
 ) -> JsonRows:
     """The tests of RQ1: a row for each algorithm and metric, against the original vehicle."""
     case.require_solutions()
@@ -304,7 +302,11 @@ def _test_original(
     for algorithm, metric in product(case.algorithms, case.scoring.metrics):
         values = _values(case, algorithm, metric, over_runs)
         originals = _originals(case, algorithm, metric, over_runs)
-        original = originals.mean() if case.study.ranges else case.original[metric.name]
+        original = (
+            originals.mean()
+            if case.study.ranges
+            else case.original_metrics[metric.name]
+        )
         if over_runs:
             test = signed_rank_test(values, originals.reindex(values.index))
             runs = test.n1
@@ -331,7 +333,7 @@ def _test_original(
 
 
 def _test_opponents(
-    case: Case,
+    case: Results,
     choices: Choices,
     *,
     over_runs: bool = False,
@@ -367,7 +369,7 @@ def _test_opponents(
     return rows
 
 
-def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
+def _samples(case: Results, choices: Choices, over_runs: bool) -> Samples:
     """The values of every metric and, unless the solutions belong to no run, of every quality
     indicator. Over runs, the numbers of minimal causes are added, if they were counted.
     """
@@ -386,7 +388,7 @@ def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
 
 
 def _values(
-    case: Case, algorithm: str, metric: Measure, over_runs: bool, column: str = ""
+    case: Results, algorithm: str, metric: Measure, over_runs: bool, column: str = ""
 ) -> pd.Series[float]:
     """The defined values of a column, by default the metric's, over the solutions that count for
     the metric, or, with `over_runs`, their mean in each run.
@@ -404,7 +406,7 @@ def _values(
 
 
 def _originals(
-    case: Case, algorithm: str, metric: Measure, over_runs: bool
+    case: Results, algorithm: str, metric: Measure, over_runs: bool
 ) -> pd.Series[float]:
     """The original vehicle's metric beside each of `_values`. If encounters are ranges, only the
     safety degree of the original vehicle is known in the same encounters: then other metrics are
@@ -412,14 +414,16 @@ def _originals(
     """
     values = _values(case, algorithm, metric, over_runs)
     if not case.study.ranges:
-        return pd.Series(case.original[metric.name], index=values.index, dtype=float)
+        return pd.Series(
+            case.original_metrics[metric.name], index=values.index, dtype=float
+        )
     if metric.name != SAFETY_DEGREE:
         return pd.Series(np.nan, index=values.index, dtype=float)
     # Every solution has both degrees: in its encounter, the original vehicle is safe.
     return _values(case, algorithm, metric, over_runs, ORIGINAL_DEGREE)
 
 
-def describe_runs_without_solutions(case: Case) -> str:
+def describe_runs_without_solutions(case: Results) -> str:
     """Sentences that say which algorithms have runs without solutions, and how these runs count; ""
     if all finished runs have solutions.
     """
@@ -442,7 +446,7 @@ def describe_runs_without_solutions(case: Case) -> str:
     )
 
 
-def titles_of(cases: Iterable[Case]) -> dict[str, str]:
+def titles_of(cases: Iterable[Results]) -> dict[str, str]:
     """Titles of algorithms, quality indicators and the cases' metrics, by name."""
     algorithms = dict[str, str]()
     metrics = dict[str, str]()

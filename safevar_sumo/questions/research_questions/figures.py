@@ -15,7 +15,7 @@ import numpy as np
 
 from safevar_sumo.errors import warn
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE
-from safevar_sumo.questions.case import Case, UnanswerableError
+from safevar_sumo.questions.case import Results, UnanswerableError
 from safevar_sumo.questions.figures import (
     BLUE,
     FONT_SIZE,
@@ -66,7 +66,7 @@ BIN_COUNT = 24
 """Number of bins of a histogram over a characteristic's domain."""
 
 
-def draw_pareto_fronts(case: Case) -> Figure:
+def draw_pareto_fronts(case: Results) -> Figure:
     """The non-dominated solutions of all runs of each algorithm together, for every pair of
     objectives.
 
@@ -97,10 +97,10 @@ def draw_pareto_fronts(case: Case) -> Figure:
 
     # The original vehicle is drawn in the same axes, with no change of itself.
     original = {
-        **case.original,
+        **case.original_metrics,
         F_DIFF.name: 0.0,
         F_NUM_DIFF.name: 0.0,
-        F_SAFE.name: case.original.get(SAFETY_DEGREE, np.nan),
+        F_SAFE.name: case.original_metrics.get(SAFETY_DEGREE, np.nan),
     }
     labels = []
     values = []
@@ -146,7 +146,7 @@ def draw_pareto_fronts(case: Case) -> Figure:
     return figure
 
 
-def draw_convergence(case: Case) -> Figure:
+def draw_convergence(case: Results) -> Figure:
     """The convergence of each algorithm: the hypervolume of all settings that a run has simulated
     so far, over their number, as median and quartiles over the runs.
 
@@ -216,7 +216,7 @@ def _add_legend_below(figure: Figure, axis: Axes) -> None:
     )
 
 
-def draw_change_counts(cases: Sequence[Case]) -> Figure:
+def draw_change_counts(cases: Sequence[Results]) -> Figure:
     """RQ3.1: the number of a run's critical solutions that change j characteristics, as box plots
     over the runs. Each case with an answer has a panel.
 
@@ -258,7 +258,7 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     return figure
 
 
-def draw_changed_characteristics(case: Case) -> Figure:
+def draw_changed_characteristics(case: Results) -> Figure:
     """RQ3.2 as a heat map: the share of critical solutions with j changed characteristics in which
     each characteristic is changed.
     """
@@ -296,7 +296,7 @@ def draw_changed_characteristics(case: Case) -> Figure:
     return figure
 
 
-def draw_change_sizes(case: Case) -> Figure:
+def draw_change_sizes(case: Results) -> Figure:
     """The distribution of each characteristic's signed changes in the critical solutions."""
     changes_of_solutions = _critical_changes(case)
     title = f"{case.name}: changes in critical solutions"
@@ -344,7 +344,7 @@ def draw_change_sizes(case: Case) -> Figure:
     return figure
 
 
-def _critical_changes(case: Case) -> FloatArray:
+def _critical_changes(case: Results) -> FloatArray:
     """The changes of the M critical solutions, shape (M, n). Raises UnanswerableError if there are
     no critical solutions.
     """
@@ -360,7 +360,7 @@ def _critical_changes(case: Case) -> FloatArray:
 
 COUNTS_FIGURE = "rq3.1-number-of-changes"
 """Name of the figure that shows all cases side by side."""
-FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
+FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Results], Figure]] = {
     "rq3.2-changed-characteristics": draw_changed_characteristics,
     "rq3.3-sizes-of-changes": draw_change_sizes,
     "pareto-fronts": draw_pareto_fronts,
@@ -369,7 +369,7 @@ FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
 
 
 @own_style()
-def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
+def draw_figures(cases: Sequence[Results]) -> dict[str, Figure]:
     """Every figure of the cases by name; with several cases, names start with the case's name.
 
     Warns
@@ -402,7 +402,7 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     return figures
 
 
-def save_figures(cases: Sequence[Case], directory: Path) -> None:
+def save_figures(cases: Sequence[Results], directory: Path) -> None:
     """Draw every figure into a png and a pdf file.
 
     Raises

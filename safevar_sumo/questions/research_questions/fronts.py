@@ -13,7 +13,7 @@ import moocore
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.questions.case import Case, UnanswerableError
+from safevar_sumo.questions.case import Results, UnanswerableError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import RunName
 
@@ -50,7 +50,7 @@ def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
     return np.asarray((points - ideal) / np.where(nadir > ideal, nadir - ideal, 1.0))
 
 
-def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
+def minimised_values(case: Results, frame: pd.DataFrame) -> FloatArray:
     """The values of the objectives, with such signs that smaller values are better, shape (rows,
     objectives); NaN for an undefined value.
     """
@@ -58,13 +58,13 @@ def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
     return frame[list(signs)].to_numpy(float) * list(signs.values())
 
 
-def points_of(case: Case, frame: pd.DataFrame) -> FloatArray:
+def points_of(case: Results, frame: pd.DataFrame) -> FloatArray:
     """The `minimised_values` of those rows in which all objectives are defined."""
     points = minimised_values(case, frame)
     return points[np.isfinite(points).all(axis=1)]
 
 
-def reference_front(case: Case) -> FloatArray:
+def reference_front(case: Results) -> FloatArray:
     """The non-dominated points among the solutions of all runs of all algorithms.
 
     Raises
@@ -80,7 +80,7 @@ def reference_front(case: Case) -> FloatArray:
     return nondominated_points(points)
 
 
-def compute_indicators(case: Case) -> pd.DataFrame:
+def compute_indicators(case: Results) -> pd.DataFrame:
     """IGD+, hypervolume and IGD of every finished run. The index has algorithm and run, and each
     indicator is a column. A run without solutions has the values of `NO_FRONT`.
 
@@ -109,7 +109,7 @@ def compute_indicators(case: Case) -> pd.DataFrame:
 
 
 def frames_of_runs(
-    case: Case, frame: pd.DataFrame
+    case: Results, frame: pd.DataFrame
 ) -> list[tuple[RunName, pd.DataFrame]]:
     """Each finished run with its rows of `frame`, in the study's order of algorithms. Raises
     UnanswerableError if no finished run has rows.
@@ -130,7 +130,7 @@ def frames_of_runs(
     return [(run, groups.get(run, frame[:0])) for run in runs]
 
 
-def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
+def valid_evaluations(case: Results, frame: pd.DataFrame) -> pd.DataFrame:
     """The rows of `frame` that a search may return: all objectives are defined, and the original
     vehicle is safe in the same encounter.
     """
@@ -138,7 +138,7 @@ def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
     return frame[is_defined & case.scoring.feasible_rows(frame)]
 
 
-def nondominated_evaluations(case: Case) -> pd.DataFrame:
+def nondominated_evaluations(case: Results) -> pd.DataFrame:
     """The evaluations of each finished run that no other evaluation of the run dominates. Random
     search returns exactly these.
 
@@ -156,7 +156,7 @@ def nondominated_evaluations(case: Case) -> pd.DataFrame:
     return pd.concat(fronts, ignore_index=True)
 
 
-def describe_rules(case: Case) -> str:
+def describe_rules(case: Results) -> str:
     """A sentence that names the algorithms whose solutions are not exactly the
     `nondominated_evaluations`; "" if there are none, or if the evaluations are unknown.
     """
@@ -176,7 +176,7 @@ def describe_rules(case: Case) -> str:
     )
 
 
-def count_evaluations(case: Case) -> pd.DataFrame:
+def count_evaluations(case: Results) -> pd.DataFrame:
     """The numbers of evaluations of every finished run. The columns are algorithm, run, requested,
     simulated and budget.
 
@@ -201,7 +201,7 @@ def count_evaluations(case: Case) -> pd.DataFrame:
     )
 
 
-def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
+def describe_evaluations(case: Results, counts: pd.DataFrame) -> str:
     """A phrase that states, for each algorithm, how many settings a run simulates on average, and
     why these are fewer than the budget. `counts` are rows of `count_evaluations`.
     """
@@ -224,11 +224,11 @@ def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
     return "; ".join(texts)
 
 
-def why_few_evaluations(case: Case) -> str:
+def why_few_evaluations(case: Results) -> str:
     """A remark on algorithms whose runs simulate less than `USUAL_SHARE` of their budget; "" if
     there are none. Algorithms that declare that they stop by themselves are not named.
     """
-    if not case.has_runs or case.evaluations.empty or not case.finished_runs:
+    if not case.has_runs or case.evaluations.empty or not case.finished:
         return ""
     counts = count_evaluations(case)
     algorithms = counts["algorithm"]
@@ -244,7 +244,7 @@ def why_few_evaluations(case: Case) -> str:
     )
 
 
-def compute_convergence(case: Case) -> pd.DataFrame:
+def compute_convergence(case: Results) -> pd.DataFrame:
     """The hypervolume of all settings that each run has simulated after several numbers of
     evaluations (different settings). The columns are algorithm, run, evaluations and hypervolume.
 
@@ -283,7 +283,7 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)
 
 
-def summarise_convergence(case: Case) -> pd.DataFrame:
+def summarise_convergence(case: Results) -> pd.DataFrame:
     """The median and the quartiles of `compute_convergence` over the runs. The columns are
     algorithm, evaluations, hypervolume (the median), low and high (the quartiles).
     """

@@ -15,7 +15,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.case import Case, build_case
+from safevar_sumo.questions.case import Results, build_case
 from safevar_sumo.questions.cause_limits import BoundaryState, Limits, find_cause_limits
 from safevar_sumo.questions.causes import (
     Causes,
@@ -60,7 +60,7 @@ RESOLUTION = 1 / 16_384
 
 
 @SLOW
-def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> None:
+def test_the_rows_are_those_of_the_solutions(case: Results, explained: Answer) -> None:
     answer = explained.to_dict()
     handles = map(str, handles_of(case.solutions))
     solutions = dict(zip(handles, case.solutions.to_dict("records"), strict=True))
@@ -84,7 +84,7 @@ def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> N
 
 
 @SLOW
-def test_the_failures_that_matter_come_first(case: Case, explained: Answer) -> None:
+def test_the_failures_that_matter_come_first(case: Results, explained: Answer) -> None:
     crashes = case.solutions[case.solutions["outcome"] == "collision"]
     by_reason = {
         reason: row
@@ -103,7 +103,7 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Answer) -> N
 
 
 @SLOW
-def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
+def test_a_named_solution_is_explained_whatever_it_is(case: Results) -> None:
     safe = (
         case.solutions["f_num_diff"].where(case.solutions["f_safe"] > 1).idxmin()
     )  # few changes have few subsets
@@ -124,7 +124,7 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
 
 
 def test_every_boundary_is_unsafe_as_it_is_printed(
-    case: Case, explained: Answer
+    case: Results, explained: Answer
 ) -> None:
     """Also each change alone at its boundary."""
     table = explained.tables.records["causes"]
@@ -147,7 +147,7 @@ def test_every_boundary_is_unsafe_as_it_is_printed(
 
 @SLOW
 def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
-    slippery: Path, case: Case
+    slippery: Path, case: Results
 ) -> None:
     """In the verdict of `study`, as `simulate` chooses them, and typed as the verdict says."""
     verdict = json_of(f"study {slippery.parent / 'slippery.toml'} --out {slippery}")[
@@ -177,7 +177,7 @@ def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
 
 
 def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
-    case: Case, explained: Answer
+    case: Results, explained: Answer
 ) -> None:
     """The limits are those of the first row; nothing names a solution."""
     leading, verdict = explained.tables["causes"].iloc[0], explained.verdict

@@ -16,7 +16,7 @@ import scipy
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.api.study import summarise
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_convergence
 from safevar_sumo.questions.research_questions.fronts import (
@@ -60,20 +60,20 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def case(study: Path) -> Case:
+def case(study: Path) -> Results:
     """Runs whose settings are evaluated by a formula: the sum of all changes makes a vehicle
     unsafe.
     """
     carried_out(load_study(str(study)), study.parent / "out")
-    return load(study.parent / "out").case
+    return load(study.parent / "out")
 
 
 @pytest.fixture(scope="module")
-def answer(case: Case) -> Answer:
+def answer(case: Results) -> Answer:
     return answer_questions([case])
 
 
-def test_random_search_returns_what_the_common_rule_takes(case: Case) -> None:
+def test_random_search_returns_what_the_common_rule_takes(case: Results) -> None:
     common, returned = nondominated_evaluations(case), case.solutions
     columns = ["run", *case.characteristics.names]
     sets = [
@@ -85,7 +85,7 @@ def test_random_search_returns_what_the_common_rule_takes(case: Case) -> None:
 
 
 def test_who_returns_the_five_worst_is_not_rewarded_by_the_common_rule(
-    answer: Answer, case: Case
+    answer: Answer, case: Results
 ) -> None:
     over_runs, common = (
         answer.tables[name].set_index(["baseline", "metric"])
@@ -106,7 +106,7 @@ def test_who_returns_the_five_worst_is_not_rewarded_by_the_common_rule(
 
 
 def test_the_table_has_the_median_and_quartiles_of_the_hypervolume_of_all_so_far(
-    answer: Answer, case: Case
+    answer: Answer, case: Results
 ) -> None:
     front = moocore.filter_dominated(case.solutions[OBJECTIVES].to_numpy(float))
     low = front.min(axis=0)
@@ -130,7 +130,7 @@ def test_the_table_has_the_median_and_quartiles_of_the_hypervolume_of_all_so_far
 
 
 def test_the_figure_shows_all_that_was_evaluated_and_marks_what_is_returned(
-    answer: Answer, case: Case
+    answer: Answer, case: Results
 ) -> None:
     (axis,) = draw_convergence(case).axes
     medians = answer.tables["convergence"].groupby("algorithm")["hypervolume"].last()
@@ -196,7 +196,7 @@ def test_what_was_not_tested_is_neither_significant_nor_not() -> None:
 
 @SLOW
 def test_a_study_prints_tests_only_where_its_runs_can_be_significant(
-    case: Case, study: Path, tmp_path: Path
+    case: Results, study: Path, tmp_path: Path
 ) -> None:
     text = summarise(load(study.parent / "out")).render("text", details=True)
     assert "RQ2 over runs" in text

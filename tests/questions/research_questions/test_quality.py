@@ -20,7 +20,7 @@ from hypothesis import given, strategies as st
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import command_function
 from safevar_sumo.questions.answer import Answer, contents_of
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import (
     draw_convergence,
@@ -201,7 +201,7 @@ def test_the_interval_of_a_median_lies_between_the_order_statistics_of_tables_of
     ).all(), "too few values"
 
 
-def rich_case(**changes: Any) -> Case:
+def rich_case(**changes: Any) -> Results:
     """Two algorithms, two runs, changes of one to three characteristics, collisions; every run has
     evaluations.
     """
@@ -227,7 +227,7 @@ def rich_case(**changes: Any) -> Case:
     )
 
 
-def special_case() -> Case:
+def special_case() -> Results:
     """Names and units with the characters that LaTeX reads as commands."""
     tables = {
         name: CharacteristicTable(unit=name, original=1, lower=0.5, upper=2)

@@ -349,7 +349,7 @@ def test_a_run_without_solutions_is_the_worst_run() -> None:
     answer = answer_questions([case])
     for name, metrics in (("rq2-runs", 3), ("rq2-common", 4)):
         tests = answer.tables[name].dropna(subset="p_value")
-        of_fronts = tests[~tests["metric"].isin(case.original)]
+        of_fronts = tests[~tests["metric"].isin(case.original_metrics)]
         assert of_fronts[["n1", "n2"]].to_numpy().tolist() == [[3, 3]] * metrics
         # of nine pairs of runs three are won and two tied
         assert of_fronts["effect_size"].to_numpy() == pytest.approx(4 / 9)

@@ -18,7 +18,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.bench import Bench
 from safevar_sumo.questions.box import Box, prove
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Results
 from safevar_sumo.questions.drives import Drives, Judged
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
@@ -152,7 +152,7 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     found = pool.evaluate(np.array([[8.5, 8.13, 2.0, 2.2], [5.0, 5.0, 5.0, 5.0]]))
     case = case_of(study, found.take([1]), found)
 
-    def asked_about(subject: Study | Case, **options: Any) -> Answer:
+    def asked_about(subject: Study | Results, **options: Any) -> Answer:
         return tolerance.compute(subject, Evaluator(study, pool), **options)
 
     bare, known = asked_about(study, unsafe=Unsafe()), asked_about(case)
