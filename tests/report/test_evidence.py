@@ -39,6 +39,7 @@ from tests.support.in_process import (
     searched,
     write,
 )
+from tests.support.report_pages import draw_few_frames
 from tools.manual import PROGRAM, ROOT
 
 MINE = """
@@ -94,7 +95,9 @@ DAMAGES = tomllib.loads(Path(__file__).with_name("damages.toml").read_text())["d
 def bare(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A pack with one answer."""
     out = tmp_path_factory.mktemp("bare") / "bare.zip"
-    run(f"evidence {slippery} --ask 'rules --samples 20' --out {out}")
+    with pytest.MonkeyPatch.context() as patch:
+        draw_few_frames(patch)
+        run(f"evidence {slippery} --ask 'rules --samples 20' --out {out}")
     return out
 
 
@@ -265,6 +268,7 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_a_pack_holds_a_list_of_cars_without_their_names(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -313,6 +317,7 @@ def damaged(content: bytes, damage: dict[str, Any]) -> bytes:
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 @pytest.mark.parametrize(
     "damage",
     DAMAGES,
@@ -340,6 +345,7 @@ def test_a_damage_is_refused_or_named(
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_what_differs_is_shown_from_both_sides(bare: Path, tmp_path: Path) -> None:
     """A file whose digest is not the one that the pack states was altered."""
     texts = texts_of(bare)
@@ -377,6 +383,7 @@ def test_an_archive_is_its_files_and_nothing_else(
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_versions_and_machines_that_differ_are_named_and_so_is_what_needs_a_search(
     bare: Path, tmp_path: Path
 ) -> None:
@@ -450,6 +457,7 @@ def test_links_bombs_and_other_files_are_refused(in_tmp: Path) -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(
     mine: Path, in_tmp: Path
 ) -> None:
@@ -547,7 +555,7 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
 
 
 @SLOW
-@pytest.mark.usefixtures("planted")
+@pytest.mark.usefixtures("planted", "few_frames")
 def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
     file = Path("planted.toml")
     rewrite(
@@ -563,6 +571,7 @@ def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
     assert verified(f"{bare} --search")[-2:] == [
         "search: outcomes",
@@ -578,6 +587,7 @@ def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("few_frames")
 def test_a_solution_that_a_run_returns_twice_is_no_damage(tmp_path: Path) -> None:
     results = searched(
         load_study("smoke", search={"algorithms": ["nsga2"]}), tmp_path / "results"
@@ -600,7 +610,7 @@ def test_a_flipped_bit_is_damage_however_the_archive_is_compressed(
             archive.writestr(name, content)
     whole = path.read_bytes()
     assert read_pack(path)[1]
-    for place in random.Random(method).choices(range(len(whole)), k=60):
+    for place in random.Random(method).choices(range(len(whole)), k=20):
         path.write_bytes(
             whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :]
         )
