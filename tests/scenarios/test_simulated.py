@@ -432,13 +432,13 @@ def test_a_cause_ends_where_the_formula_does_and_weather_is_not_said(
     wall: Path,
 ) -> None:
     """Failures are explained without reference drivers."""
-    found = json_of("explain wall.toml")
+    found = json_of("explain wall.toml --simulations 3000")
     assert found["numbers"]["collisions"] is None
     assert not rows_of(found, "drivers")
     causes = rows_of(found, "causes")
     (share,) = (row["begins_at"] for row in causes if row["causes"] == {"decel": 3})
     assert 8 - 5 * share == pytest.approx(225 / 2 / 32.5, abs=0.1)
-    assert "weather" not in run("tolerance wall.toml --quick").stdout
+    assert "weather" not in run("tolerance wall.toml --simulations 400").stdout
 
 
 NOISY = """
