@@ -223,16 +223,18 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     system = system_of(task.study)
     if task.in_sumo:
         system = replace(system, in_sumo=True)
-    # Compilation comes first, because it may take longer than the time limit of a batch.
-    with system.modules.active():
-        system.vehicle.compile()
     # With a simulator that takes long, each run has the time limit instead of the batch.
     limit = end_if_longer(task.study.search.time_limit)
-    with nullcontext() if system.mover.takes_long else limit:
-        if task.selection != EVERYTHING:
-            evaluations = _evaluate_parameters(task.selection.of(system), task, rows)
-        else:
-            evaluations = drive_and_score(system, rows)
+    with system.modules.active():
+        # Compilation comes first, because it may take longer than the time limit of a batch.
+        system.vehicle.compile()
+        with nullcontext() if system.mover.takes_long else limit:
+            if task.selection != EVERYTHING:
+                evaluations = _evaluate_parameters(
+                    task.selection.of(system), task, rows
+                )
+            else:
+                evaluations = drive_and_score(system, rows)
     if user_code_names(task.study) and system.repeats == 1:
         _first_batches.setdefault(
             msgspec.msgpack.encode(task.study), (task, rows, evaluations)
