@@ -5,6 +5,7 @@ pools compute.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -42,8 +43,9 @@ collect_ignore = (
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
-# Programs that tests start need not compile the package each time.
+# Programs that tests start, and the next session, need not compile everything each time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 SLIPPERY = """
 extends = "smoke"
 name = "slippery"

@@ -333,12 +333,17 @@ def test_a_log_has_command_versions_stages_and_warnings_of_each_call(
 ) -> None:
     Path("log.txt").write_text("of others\n")
     for seed in (1, 2):
-        run(f"study smoke --runs 1 --seed {seed} --out r{seed} --log log.txt")
+        run(
+            f"study smoke --algorithms rs --runs 1 --seed {seed} --out r{seed} --log log.txt"
+        )
     run("simulate r1 --set tireFric=1 --log log.txt")
     log = Path("log.txt").read_text()
     assert log.startswith("of others\n")
     for seed in (1, 2):
-        assert f"study smoke --runs 1 --seed {seed} --out r{seed} --log log.txt" in log
+        assert (
+            f"study smoke --algorithms rs --runs 1 --seed {seed} --out r{seed} --log log.txt"
+            in log
+        )
     assert log.count(f"with safevar_sumo {sv.__version__}, libsumo 1.28.0") == 3
     assert len(re.findall(r"smoke: search of \d+ runs with 2 workers into r", log)) == 2
     assert len(re.findall(r"smoke: searched in [\d.]+ s$", log, re.MULTILINE)) == 2

@@ -244,7 +244,7 @@ def test_processes_belong_to_one_version(
     for name in MARGINS:
         Path(name, "driver.py").write_text(THREAD)
     with open_pool(1) as pool:
-        answer = sv.compare(studies["old"], studies["new"], samples=64, pool=pool)
+        answer = sv.compare(studies["old"], studies["new"], simulations=200, pool=pool)
         assert sorted(pool._started) == [0, 1]
     assert answer.numbers["decision"] == "do not release"
     degrees = answer.numbers["a_degree"], answer.numbers["b_degree"]

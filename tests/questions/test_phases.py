@@ -140,7 +140,7 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     tips = np.flatnonzero((np.abs(np.diff(left)) > 0.3)[:-1])
     lower = np.where(left[tips] < left[tips + 1], tips, tips + 1)
     assert len(lower) > 3
-    some = np.arange(lower[0], lower[-1], 97)
+    some = np.arange(lower[0], lower[-1], 251)
     claim = model.in_phases
     assert claim is not None
 

@@ -12,6 +12,7 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions import cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import failures
 from safevar_sumo.questions.part import with_ranges
@@ -71,8 +72,11 @@ REMARK = "never moved, although the original vehicle moves in the same encounter
 
 
 @pytest.fixture(autouse=True)
-def studies(coarse: None, few_simulations: None, in_tmp: Path) -> None:
+def studies(
+    coarse: None, few_simulations: None, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The study; one in which only the original car starts; and one in which no car starts."""
+    monkeypatch.setattr(cases, "LEAST_SIMULATIONS", 200)
     write("stalled.py", STALLED)
     write("some.toml", STUDY)
     write("none.toml", STUDY.replace("volt = 9.0", "volt = 12.0, decel = 8.0"))
@@ -108,9 +112,9 @@ def test_causes_are_among_the_vehicles_that_moved(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Of two single changes, the voltage is no simulated one, and no cause."""
-    monkeypatch.setattr(failures, "SAMPLED_SETTINGS", 400)
+    monkeypatch.setattr(failures, "SAMPLED_SETTINGS", 200)
     answer = sv.explain("some.toml", pool=InlinePool())
-    assert answer.numbers["settings"] == pytest.approx(200, abs=40)
+    assert answer.numbers["settings"] == pytest.approx(100, abs=30)
     assert answer.numbers["tried"] == 1
     (cause,) = answer.tables["causes"]["causes"]
     assert set(cause) == {"decel"}

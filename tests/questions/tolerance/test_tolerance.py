@@ -120,6 +120,31 @@ def test_a_search_that_gives_up_says_that_it_found_no_box(
     ]
 
 
+def test_a_quick_answer_ends_limits_at_failures_and_keeps_to_what_its_bar_announced() -> (
+    None
+):
+    """Smaller values of a and b are no worse, and c does nothing: these ends have no limit. A quick
+    answer simulates at most an eighth of the usual 15,000 + 80,000.
+    """
+    shown = list[int]()
+    answer = answer_of(
+        3,
+        lambda rows: np.maximum(rows - 5, 0) @ [1, 0.5, 0] > 4,
+        unsafe="collision",
+        quick=True,
+        progress=lambda _, done, total: shown.extend((done, total)),
+    )
+    limits = answer.tables["limits"].set_index("characteristic")
+    high = limits["together_high"]
+    assert limits["together_low"].tolist() == [0, 0, 0]
+    assert high["c"] == 10
+    assert high["a"] - 5 + 0.5 * (high["b"] - 5) <= 4
+    assert "C may have any value of its domain" in answer.verdict or high["b"] == 10
+    _, announced, *_ = shown
+    assert announced <= (3 * 5_000 + 80_000) / 8
+    assert max(shown) == announced
+
+
 def test_an_answer_says_that_not_all_corners_were_simulated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

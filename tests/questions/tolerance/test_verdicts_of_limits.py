@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import safevar_sumo as sv
-from tests.support.in_process import InlinePool, json_of, refused, rows_of, run, write
+from tests.support.in_process import json_of, refused, rows_of, run, write
 
 SHARES = """
 class Shares:
@@ -139,64 +138,14 @@ def test_explain_and_tolerance_say_the_same_of_an_unsafe_original_vehicle(
         assert "┏" not in printed, "a table without content"
 
 
-@pytest.mark.parametrize(
-    "command", ["risk", "explain", "tolerance", "rules --samples 500"]
-)
+@pytest.mark.parametrize("question", ["risk", "explain"])
 def test_collisions_are_named_where_no_vehicle_meets_the_criterion(
-    command: str, in_tmp: Path
+    question: str, in_tmp: Path
 ) -> None:
+    """A question that samples vehicles, and one that searches; the remark is that of any other."""
     write_wall(12000)
-    name, _, flags = command.partition(" ")
-    rest = f"wall.toml {flags} --simulations 600 --details"
+    command = f"{question} wall.toml --simulations 200 --details"
     told = "simulated vehicles collide, although no vehicle is unsafe by the criterion"
-    with_criterion = run(f"{name} {rest} --unsafe 'safety_degree < -40'", expect=None)
+    with_criterion = run(f"{command} --unsafe 'safety_degree < -40'", expect=None)
     assert told in " ".join(with_criterion.stdout.split())
-    assert told not in " ".join(run(f"{name} {rest}", expect=None).stdout.split())
-
-
-LINE = """
-class Line:
-    UNITS = {"a": "mm", "b": "mm", "c": "mm"}
-    version = "1"
-
-    def simulate(self, setting):
-        degree = 4 - max(setting["a"] - 5, 0) - 0.5 * max(setting["b"] - 5, 0)
-        return {"outcome": "stopped" if degree > 0 else "collision", "safety_degree": degree}
-"""
-LINE_STUDY = """
-name = "line"
-title = "Three values"
-scenario.model = "line:Line"
-metrics.ttc_threshold = 1.5
-search = { algorithms = ["rs"], population = 20, evaluations = 40, runs = 1, seed = 1 }
-[vehicle.characteristics]
-a = { unit = "mm", original = 5, lower = 4.9, upper = 10 }
-b = { unit = "mm", original = 5, lower = 0, upper = 10 }
-c = { unit = "mm", original = 5, lower = 0, upper = 10 }
-"""
-
-
-def test_a_quick_answer_ends_limits_at_failures_and_keeps_to_what_its_bar_announced(
-    in_tmp: Path,
-) -> None:
-    """Smaller values of `a` and `b` are no worse, and `c` does nothing: these ends have no limit.
-    A quick answer simulates at most an eighth of the usual 15,000 + 80,000.
-    """
-    write("line.py", LINE)
-    write("line.toml", LINE_STUDY)
-    shown = list[tuple[int, int]]()
-    answer = sv.tolerance(
-        "line.toml",
-        quick=True,
-        pool=InlinePool(),
-        progress=lambda _, done, total: shown.append((done, total)),
-    )
-    limits = answer.tables["limits"].set_index("characteristic")
-    low, high = limits["together_low"], limits["together_high"]
-    assert (low["a"], low["b"], low["c"], high["c"]) == (4.9, 0, 0, 10)
-    assert high["a"] - 5 + 0.5 * (high["b"] - 5) <= 4 - 0.3
-    assert high["a"] < 10
-    assert "C may have any value of its domain" in answer.verdict or high["b"] == 10
-    (_, announced), *_ = shown
-    assert announced <= (3 * 5_000 + 80_000) / 8
-    assert max(max(pair) for pair in shown) == announced
+    assert told not in " ".join(run(command, expect=None).stdout.split())
