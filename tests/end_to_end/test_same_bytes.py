@@ -1,7 +1,7 @@
 """A command writes the same bytes for any number of worker processes and any size of batches.
 
 An author of a question adds a row. `repair`, which takes minutes, is asked in
-`tests/questions/test_repair.py`.
+`tests/questions/repair/test_repair.py`.
 """
 
 from __future__ import annotations

@@ -11,10 +11,9 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.permit import permit
-from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.speed_search import Cars
 from safevar_sumo.study import Study
-from tests.support.in_process import SLOW, InlinePool, write
+from tests.support.in_process import SLOW, write
 from tests.support.made_up_studies import places
 
 pytestmark = pytest.mark.usefixtures("made_up_studies")
@@ -56,36 +55,6 @@ def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
         together = both.tables[name]
         own = together[together["car"] == "b"].reset_index(drop=True)
         pd.testing.assert_frame_equal(own, alone.tables[name], check_dtype=False)
-
-
-def test_a_needed_speed_is_no_less_where_the_new_car_is_unsafe_too() -> None:
-    for up_to, need, expected in (
-        (50, 55, "up to"),
-        (55, 55, "drive"),
-        (45, 55, "up to"),
-        (50, None, "drive"),
-        (49, None, "up to"),
-        (None, None, "stop"),
-    ):
-        assert verdict_of(up_to, 50, 60, need, is_proven=True) == expected, (
-            up_to,
-            need,
-        )
-
-
-@SLOW
-def test_a_car_passes_a_test_of_a_regulation() -> None:
-    """It is no promise for the road."""
-    told = permit(
-        "r152",
-        cars={"a": {"brakeTorque": 0.9}},
-        others="new",
-        quick=True,
-        pool=InlinePool(),
-    ).verdict
-    assert '"a" can pass the test up to 40 km/h' in told
-    assert "A new car can pass the test up to 40 km/h" in told
-    assert "may drive" not in told
 
 
 def test_all_corners_of_five_measured_values_drive_the_grid() -> None:
