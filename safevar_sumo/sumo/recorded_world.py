@@ -60,8 +60,8 @@ class RecordedWorld:
         self._size = size
         self._scene = recording
         self._is_person = np.array([film.is_person for film in films], bool)
-        sizes = np.array([(film.length, film.width) for film in films])
-        self._sizes = sizes.reshape(-1, 2)
+        sizes = [(film.length, film.width) for film in films]
+        self._sizes = np.reshape(sizes, (-1, 2))
         self._motion = nans((n_samples, n_scenes, len(films), 5))
         for actor, film in enumerate(films):
             length = len(film.motion)
@@ -77,9 +77,7 @@ class RecordedWorld:
         across the way, shape (2, A) [m].
         """
         begins = self._middles @ recording.along - self._reach[0]
-        first_begins = np.fmin.reduce(
-            begins.reshape(n_samples, -1), axis=1, initial=np.inf
-        )
+        first_begins = np.fmin.reduce(begins, axis=(1, 2), initial=np.inf)
         self._begins = first_begins + recording.length / 2
         """Position along the way that a front must have reached to touch somebody, at every sample
         [m]; infinite without actors.

@@ -280,8 +280,6 @@ def _assemble(study: Study) -> System:
 
     single = Point(scenario, weather_of(study.weather))
     points = _original_points(study, lookup, single) or matrix or (single,)
-    if not matrix:
-        points = (Point(points[0].scenario, points[0].weather),)
 
     region = region_of(study)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
