@@ -114,16 +114,14 @@ class SharesOverSets(NamedTuple):
     study
         The study of the vehicles.
     shares
-        Share of unsafe vehicles by set and group, shape (S, G). The study's own set has the first
-        row. The share is NaN if no vehicle of the group could be simulated. S is 0 if the user
-        limits the number of simulations, or if the study's own set is the only one.
-    intervals
-        Lower and upper end of the 95 % confidence interval of each share, shape (S, G, 2).
+        Share of unsafe vehicles by set and group, and the lower and upper end of its 95 %
+        confidence interval, shape (S, G, 3). The study's own set has the first row. The share is
+        NaN if no vehicle of the group could be simulated. S is 0 if the user limits the number of
+        simulations, or if the study's own set is the only one.
     """
 
     study: Study
     shares: FloatArray
-    intervals: FloatArray
 
     @classmethod
     def of(
@@ -162,15 +160,14 @@ class SharesOverSets(NamedTuple):
                 for group in members & evaluations.valid:
                     count = round(float(share_of_repeats[group].sum()), SHARE_DECIMALS)
                     rows.append(share_with_interval(count, int(group.sum())))
-        table = np.array(rows).reshape(-1, len(members), 3)
-        return cls(evaluator.study, table[..., 0], table[..., 1:])
+        return cls(evaluator.study, np.array(rows).reshape(-1, len(members), 3))
 
     def numbers(self, share: float) -> JsonObject:
         """The shares and intervals of the first group (all vehicles), in the order of the sets. If
         no set was simulated here, the list of shares has `share` alone.
         """
-        shares = self.shares[:, 0].tolist() or [share]
-        return {BY_SET: shares, INTERVALS: self.intervals[:, 0].tolist()}
+        shares = self.shares[:, 0, 0].tolist() or [share]
+        return {BY_SET: shares, INTERVALS: self.shares[:, 0, 1:].tolist()}
 
     def ends(
         self, group: int, own_share: Sequence[float]
@@ -181,8 +178,7 @@ class SharesOverSets(NamedTuple):
         `own_share` is a share and the two ends of its interval, from a larger sample of the group
         with the study's own set. It counts beside the shares of all sets.
         """
-        rows = np.column_stack([self.shares[:, group], self.intervals[:, group]])
-        share, low, high = np.vstack([own_share, rows]).T
+        share, low, high = np.vstack([own_share, self.shares[:, group]]).T
         smallest, lowest = np.fmin.reduce([share, low], axis=1).tolist()
         greatest, highest = np.fmax.reduce([share, high], axis=1).tolist()
         return smallest, greatest, lowest, highest
@@ -193,7 +189,7 @@ class SharesOverSets(NamedTuple):
         """
         if not self.study.spread:
             return
-        shares = self.shares[:, 0]
+        shares = self.shares[:, 0, 0]
         if np.isnan(shares).all():
             yield ONE_SET
             return
@@ -214,9 +210,9 @@ class SharesOverSets(NamedTuple):
         """The share of all vehicles with a set, in percent with its interval. The text names the
         set if its interval overlaps with the interval of no other set.
         """
-        intervals = np.delete(self.intervals[:, 0], number, axis=0)
-        low, high = self.intervals[number, 0]
-        is_apart = ((intervals[:, 1] < low) | (intervals[:, 0] > high)).all()
+        share, low, high = self.shares[number, 0]
+        _, lows, highs = np.delete(self.shares[:, 0], number, axis=0).T
+        is_apart = ((highs < low) | (lows > high)).all()
         name = f"set {number}, " if is_apart else ""
         interval = f"95 % confidence interval {interval_in_words(low, high)}"
-        return f"{percentage(self.shares[number, 0])} % ({name}{interval})"
+        return f"{percentage(share)} % ({name}{interval})"

@@ -23,7 +23,7 @@ from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.over_sets import SETS_STAGE, VEHICLES, SharesOverSets
 from safevar_sumo.questions.risk import influence_in_words
 from safevar_sumo.questions.rules import SAMPLED_STAGE
-from safevar_sumo.questions.sampling import clopper_pearson
+from safevar_sumo.questions.sampling import clopper_pearson, share_with_interval
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -343,9 +343,8 @@ def test_risk_rules_and_explain_simulate_the_same_vehicles_with_each_parameter_s
 def test_a_parameter_set_is_named_where_its_interval_leaves_the_others_out(
     failing: tuple[int, ...], least: str, greatest: str
 ) -> None:
-    intervals = np.array([[clopper_pearson(count, VEHICLES)] for count in failing])
-    shares = np.array([[count / VEHICLES] for count in failing])
-    ((_, words),) = SharesOverSets(load_study("wear"), shares, intervals).sentences()
+    shares = np.array([[share_with_interval(count, VEHICLES)] for count in failing])
+    ((_, words),) = SharesOverSets(load_study("wear"), shares).sentences()
     assert least in words
     assert greatest in words
 
@@ -389,8 +388,7 @@ def test_the_first_sentence_of_rules_says_what_lies_outside_of_the_regions() -> 
 
 
 def test_sets_without_an_unsafe_vehicle_are_told_by_a_count() -> None:
-    shares = np.zeros((20, 1))
-    over_sets = SharesOverSets(load_study("smoke"), shares, np.zeros((20, 1, 2)))
+    over_sets = SharesOverSets(load_study("smoke"), np.zeros((20, 1, 3)))
     (sentence,) = over_sets.sentences()
     assert "None of these vehicles is unsafe." in sentence.text
     assert "0 %" not in sentence.text
