@@ -388,8 +388,11 @@ def _values(
     """
     # A decimal comma is possible if semicolons separate the columns, or once did so (",;"). Then a
     # single number with a comma shows that the whole file has decimal commas.
-    stated = [row[column].strip() for row in cells.rows for column in columns]
-    has_commas = any("," in text and NUMBERS[","].fullmatch(text) for text in stated)
+    has_commas = any(
+        "," in row[column] and NUMBERS[","].fullmatch(row[column].strip())
+        for row in cells.rows
+        for column in columns
+    )
     mark = ";" if cells.separator == ";" else "."
     mark = "," if ";" in cells.separator and has_commas else mark
     settings = np.full((len(cells.rows), len(vehicle)), np.nan)
