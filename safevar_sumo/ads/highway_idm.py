@@ -54,6 +54,6 @@ class HighwayIdm(ScalarAds):
             front.position[0] = observation.gap + (me.LENGTH + front.LENGTH) / 2
             front.speed = float(observation.obstacle_speed)
             leader = front
-        wish = float(me.acceleration(me, leader))
+        wish = me.acceleration(me, leader)
         acceleration = min(max(wish, -me.ACC_MAX), me.ACC_MAX)
         return self.pedals(acceleration, observation.speed)

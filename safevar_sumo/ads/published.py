@@ -236,7 +236,7 @@ class _RailsMemory(NamedTuple):
     """
 
     is_braking: BoolArray
-    pending_commands: tuple[Command, ...]
+    pending_commands: list[Command]
     recognition_line: DelayLine
     hesitation_line: DelayLine
 
@@ -296,7 +296,7 @@ class WorldOnRails(Ads, Table, frozen=True, kw_only=True):
         idle = Command(np.zeros(n), np.zeros(n))
         return _RailsMemory(
             np.zeros(n, bool),
-            (idle,) * round(self.latency / step),
+            [idle] * round(self.latency / step),
             DelayLine.by(self.recognition_delay, step),
             DelayLine.by(self.hesitation, step),
         )
@@ -323,7 +323,7 @@ class WorldOnRails(Ads, Table, frozen=True, kw_only=True):
         )
         delayed_brake, hesitation_line = memory.hesitation_line.delayed(command.brake)
         memory = _RailsMemory(
-            is_braking, tuple(pending_commands), recognition_line, hesitation_line
+            is_braking, pending_commands, recognition_line, hesitation_line
         )
         return Command(
             command.throttle, np.minimum(command.brake, delayed_brake)

@@ -27,7 +27,7 @@ def runs_in_words(fails: BoolArray) -> str:
 
     if len(fails) < 2:
         return ""
-    count = int(fails.sum())
+    count = fails.sum()
     low, high = scipy.stats.binomtest(count, len(fails)).proportion_ci(method="exact")
     interval = f"95 %: {_percentage(low)} to {_percentage(high)} %"
     return f"fails in {count} of {len(fails)} repeated runs ({interval})"

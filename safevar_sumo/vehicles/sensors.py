@@ -68,7 +68,7 @@ class DelayedSignal:
         InputError
             If a delay is longer than `LONGEST_DELAY`.
         """
-        longest = float(np.max(delay))
+        longest = np.max(delay)
         age = delay / step
         if not longest <= LONGEST_DELAY:
             raise InputError(
