@@ -39,7 +39,7 @@ def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_ou
         [np.array([7.13005, 5.0]), np.array([7.5, 5.0])],
     )
     assert [*found] == [0], "a setting that is safe is not described"
-    assert sliver(found[0].setting[np.newaxis])[0]
+    assert sliver(np.array([[*found[0].failing_values.values()]]))[0]
 
 
 def test_a_described_setting_stays_within_the_limits_that_it_breaks() -> None:
@@ -47,7 +47,7 @@ def test_a_described_setting_stays_within_the_limits_that_it_breaks() -> None:
     model = made_up_model(2, lambda rows: rows[:, 0] > 7)
     within = Box(region_of(study), np.array([5.0, 5.0]), np.array([7.1234, 5.0]))
     found = describe(model, [np.array([7.12339, 5.0])], within)
-    assert within.holds(found[0].setting[np.newaxis])[0]
+    assert within.holds(np.array([[*found[0].failing_values.values()]]))[0]
 
 
 def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:
