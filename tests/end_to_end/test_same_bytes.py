@@ -1,7 +1,6 @@
 """A command writes the same bytes for any number of worker processes and any size of batches.
 
-An author of a question adds a row. `repair`, which takes minutes, is asked in
-`tests/questions/repair/test_repair.py`.
+An author of a question adds a row.
 """
 
 from __future__ import annotations
@@ -24,6 +23,8 @@ QUESTIONS = {
     "risk": "small.toml --samples 300",
     "rules": "small.toml --samples 300",
     "compare": "small.toml smoke --samples 100",
+    "permit": "wear --point CPLA --set treadDepth=3 --others new --quick",
+    "repair": "autoware_july --promise brakeTorque>=0.9 --quick --fits 0",
 }
 """What each command is asked."""
 

@@ -17,10 +17,12 @@ import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.questions.permit.permits import cars_of
+from safevar_sumo.questions.permit.speed_search import Cars
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.support.in_process import SLOW
+from tests.support.made_up_studies import places
 
 JOINT = with_ranges(sv.load_study("wear"))
 VEHICLE = CharacteristicSet.of(JOINT).vehicle
@@ -160,6 +162,13 @@ def test_a_measured_value_may_be_any_within_its_precision_and_the_domain() -> No
         assert (cars.lower[column], cars.upper[column]) == (low, high)
         assert {*cars.vehicles[:, column]} == {low, high}
         assert (cars.vehicles[:, others] == setting[others]).all()
+
+
+def test_all_corners_of_five_measured_values_drive_the_grid() -> None:
+    """16 of 32 corners meet each encounter."""
+    cars = Cars.measured(np.zeros(5), np.ones(5))
+    met = cars.drives_in(places(*np.arange(9.0))).vehicle
+    assert (len(met), len(np.unique(met, axis=0))) == (9 * 16, 32)
 
 
 HEAD = "car,treadDepth,brakeTorque,payload\n"

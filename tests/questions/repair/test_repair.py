@@ -35,31 +35,9 @@ from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.support.in_process import SLOW, InlinePool, rows_of
 from tests.support.made_up_studies import places
-from tests.support.planted_sled import GAP_TODAY, MARGIN, SPEED, STUDY
+from tests.support.planted_sled import GAP_TODAY, MARGIN, STUDY
 
 pytestmark = pytest.mark.usefixtures("made_up_studies")
-
-
-def gap_for(grip: float) -> float:
-    """The gap at which a sled has to brake so that it stops `MARGIN` before the obstacle."""
-    return MARGIN + SPEED**2 / (2 * grip)
-
-
-@SLOW
-def test_the_repair_of_a_planted_system_equals_the_closed_form(
-    planted: Path,
-) -> None:
-    found, again = (
-        sv.repair(planted, change=["gap", "colour"], pool=pool)
-        for pool in (InlinePool(2), InlinePool())
-    )
-    assert again.to_dict() == found.to_dict()
-    (repair,) = rows_of(found.to_dict(), "repairs")
-    needed = max(
-        gap_for(5), gap_for(5 * 0.9) - MARGIN
-    )  # another fit than the study's own needs not to collide
-    assert repair["parameters"] == {"gap": pytest.approx(needed, rel=0.01)}
-    assert (repair["fits"], repair["proof_failures"]) == (3, 0)
 
 
 @SLOW
