@@ -170,21 +170,6 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
     run("verify pack.zip")
 
 
-@SLOW
-def test_an_undefined_measure_is_counted(folder: Path) -> None:
-    (folder / "nowhere.py").write_text(
-        HARDEST_BRAKING.replace("return np.where", "return np.nan * np.where")
-    )
-    (folder / "mine.toml").write_text(STUDY.replace("hardest_braking", "nowhere"))
-    verdict = json_of("risk mine.toml --samples 64 --unsafe 'hardest > 6.8'")["verdict"]
-    (counts,) = re.findall(
-        r"hardest is undefined, without a collision, in ([\d,]+) of ([\d,]+) simulated",
-        verdict,
-    )
-    undefined, simulated = (int(text.replace(",", "")) for text in counts)
-    assert 0 < undefined < simulated, "some of all collide"
-
-
 def test_a_clearance_is_between_bumpers_where_the_degree_is_between_middles() -> None:
     """A vehicle that brakes by 4.7 m/s^2 stops 4.75 m between middles before one as long as
     itself: nothing of the results but the criterion is between bumpers.

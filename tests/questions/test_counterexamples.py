@@ -5,16 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safevar_sumo import tolerance
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import describe
-from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import region_of
 from tests.support.in_process import (
     SLOW,
-    InlinePool,
     json_of,
     numbers_of,
     rows_of,
@@ -48,17 +44,6 @@ def test_a_described_setting_stays_within_the_limits_that_it_breaks() -> None:
     within = Box(region_of(study), np.array([5.0, 5.0]), np.array([7.1234, 5.0]))
     found = describe(model, [np.array([7.12339, 5.0])], within)
     assert within.holds(np.array([[*found[0].failing_values.values()]]))[0]
-
-
-def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:
-    study = load_study("wear")
-    evaluator = Evaluator(study, InlinePool(), verified=0)
-    answer = tolerance.compute(study, evaluator, margin=30)
-    assert evaluator.simulated <= 2
-    assert answer.verdict.startswith(
-        "The original vehicle is already unsafe: it keeps 0.88 m"
-    )
-    assert answer.numbers["kept"] is False
 
 
 @SLOW

@@ -270,6 +270,7 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(
     )
     answer = json_of("compare results wider.toml --samples 64", expect=4)
     assert re.search(LEFT_OUT.format(r"[\d,]+"), answer["verdict"])
+    assert "were not tested in the same way" in answer["verdict"]
     assert answer["numbers"]["margin"] == 0.1, "as in tolerance"
     assert answer["numbers"]["only_a_unsafe"] == answer["numbers"]["only_b_unsafe"] == 0
     frame = rows_of(answer, "settings")

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.questions.ask import find_question
 from safevar_sumo.questions.part import at_point, scope_of
 from safevar_sumo.questions.worlds import moving_tests
 from safevar_sumo.sumo.system import assemble
@@ -21,15 +20,9 @@ pytestmark = pytest.mark.usefixtures("made_up_studies")
 
 
 @SLOW
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [("rules", {"samples": 32}), ("tolerance", {"simulations": 240})],
-)
-def test_a_question_about_a_part_prints_commands_about_it(
-    name: str, options: dict[str, Any]
-) -> None:
+def test_a_question_about_a_part_prints_commands_about_it() -> None:
     part: dict[str, Any] = {"ranges": True, "point": "CPLA", "up_to": "speed=40"}
-    answer = find_question(name)("wear", pool=InlinePool(), **options, **part)
+    answer = sv.rules("wear", samples=32, pool=InlinePool(), **part)
     typed = answer.command.removeprefix(PROGRAM)
     assert json_of(f"{typed} --jobs 1") == json.loads(answer.render("json"))
     following = shlex.split(answer.next)[4:]

@@ -13,6 +13,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions import budget, price
+from safevar_sumo.questions.between import AT_ONE_PHASE
 from safevar_sumo.questions.budget import Budget, round_down
 from tests.support.in_process import SLOW, InlinePool, refused, run, write
 from tests.support.wall import MODELS, STUDY
@@ -43,6 +44,7 @@ def test_joint_limits_of_few_simulations_are_safe_by_the_formula(rig: str) -> No
         "no line was scanned"
     )
     assert answer.numbers["kept"] is None
+    assert AT_ONE_PHASE in answer.tested
 
 
 def test_few_simulations_state_no_limits_that_leave_a_part_no_room(rig: str) -> None:

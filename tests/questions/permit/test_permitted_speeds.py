@@ -254,7 +254,6 @@ def test_the_assumed_value_that_matters_most_is_that_of_the_formula() -> None:
         }
         worst = min(failing, key=lambda name: failing[name])
         assert row["assumed_matters_most"] == worst
-        assert f"unsafe already at {failing[worst]:g} m/s" in answer.verdict
 
 
 def test_a_needed_speed_decides_the_exit_code() -> None:

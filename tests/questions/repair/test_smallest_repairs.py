@@ -15,6 +15,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.evaluation import evaluate_settings
 from safevar_sumo.questions import repair as question
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.between import AT_ONE_PHASE
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.repair import find
 from safevar_sumo.questions.repair.found import Price
@@ -184,6 +185,7 @@ def test_sets_in_which_no_repair_holds_are_named() -> None:
     assert NEEDED <= repair["parameters"]["gap"] <= NEEDED + 0.1
     assert (answer.numbers["fits"], answer.numbers["fits_tried"]) == (2, 3)
     assert "parameter set 1" in answer.tested
+    assert AT_ONE_PHASE in answer.tested
 
 
 def test_wear_that_nobody_can_keep_safe_is_named_and_left_out() -> None:

@@ -132,6 +132,19 @@ def test_sobol_indices_of_ishigamis_function(
     assert table["characteristic"].iloc[0] == "a", "what decides most stands first"
 
 
+def test_an_undefined_measure_is_counted_without_the_collisions() -> None:
+    """`tet` is undefined in one half, of which 9 % of all vehicles collide."""
+    study = made_up_study(3)
+    plant = MeasuredPlant(study, box)
+    verdict = risk(study, unsafe="tet > 100", samples=400, pool=plant).verdict
+    told = re.search(
+        r"tet is undefined, without a collision, in ([\d,]+) of ([\d,]+) sim", verdict
+    )
+    assert told is not None
+    undefined, simulated = (int(text.replace(",", "")) for text in told.groups())
+    assert undefined / simulated == pytest.approx(0.5 - 0.09, abs=0.02)
+
+
 def test_first_order_indices_of_constrained_characteristics() -> None:
     """Y = a, where a + b is at most 10: knowing b leaves a uniform between 0 and 10 - b, whose mean
     has a quarter of the variance. Sobol's design does not exist, and total indices are undefined.
