@@ -134,14 +134,6 @@ def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not() -> Non
 
 
 @SLOW
-def test_a_child_that_comes_out_late_tells_nothing_of_a_competent_driver() -> None:
-    """He hits it in the original vehicle."""
-    assert avoiders(evaluator(test="CPNCO", speed=40), vehicle(brakes=0.99)) == [
-        "full braking"
-    ]
-
-
-@SLOW
 def test_behind_a_leader_that_brakes_with_4_a_competent_driver_has_no_verdict() -> None:
     tests = [
         {"name": "CCRb", "parameters": {"test": "CCRb"}, "over": {"speed": [40, 50]}}

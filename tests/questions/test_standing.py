@@ -134,7 +134,11 @@ def test_no_verdict_is_given_if_only_the_original_vehicle_moves(question: str) -
 
 
 def test_two_versions_are_compared_by_the_vehicles_that_moved() -> None:
-    assert "RELEASE" in run("compare some.toml some.toml --samples 60").stdout
+    """A system does not differ from itself."""
+    answer = json_of("compare some.toml some.toml --samples 60")
+    assert answer["verdict"].startswith("RELEASE: B does not differ from A in anything")
+    names = ("only_a_unsafe", "only_b_unsafe", "p", "a12")
+    assert [answer["numbers"][name] for name in names] == [0, 0, 1.0, 0.5]
 
 
 def test_standing_is_right_where_the_original_vehicle_stands() -> None:

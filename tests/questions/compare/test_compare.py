@@ -23,9 +23,7 @@ from safevar_sumo.questions.tolerance import asked
 from tests.support.in_process import (
     SLOW,
     InlinePool,
-    json_of,
     refused,
-    rows_of,
     run,
     searched,
     write,
@@ -238,16 +236,6 @@ def test_neither_of_two_worse_versions_is_released(
     assert said is not None, answer.verdict
     for speed in said.groups():
         assert float(speed) == pytest.approx(-answer.numbers["b_degree"], abs=0.005)
-
-
-@SLOW
-def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
-    answer = json_of("compare smoke smoke --samples 100")
-    numbers, limits = answer["numbers"], rows_of(answer, "limits")
-    assert (numbers["only_a_unsafe"], numbers["only_b_unsafe"]) == (0, 0)
-    assert (numbers["p"], numbers["a12"], numbers["settings"]) == (1.0, 0.5, 100)
-    assert [one["a_low"] for one in limits] == [one["b_low"] for one in limits]
-    assert answer["verdict"].startswith("RELEASE: B does not differ from A in anything")
 
 
 @SLOW

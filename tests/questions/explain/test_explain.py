@@ -450,3 +450,5 @@ def test_of_an_unsafe_original_no_change_is_a_cause(
         for name in ("causes", "characteristics", "distinct_causes")
     ] == [0, 0, 0]
     assert "Minimal causes" not in answer.render("text")
+    assert answer.failures
+    assert "simulate" in answer.next

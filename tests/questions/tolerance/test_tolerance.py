@@ -462,6 +462,8 @@ def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:
             study, pool=plant, unsafe="safety_degree < 8.5", limits=limits
         )
         assert len(plant.seen) == 1, "nothing else is simulated"
+        assert answer.lead == ("limits" if limits else None), "no table without content"
+        assert "simulate" in answer.next
         (refusal,) = answer.failures
         assert "is already unsafe: it has a" in refusal, "a limit is not blamed"
         told = f"{refusal} Therefore no limit can be given. Ask again with a weaker"
