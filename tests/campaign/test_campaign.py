@@ -65,8 +65,6 @@ def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
     ("workers", "runs_at_once", "sizes"),
     [
         (2, 160, {45}),
-        (1, 80, {45}),
-        (4, 160, {22, 23}),
         (16, 160, {5, 6}),
         (200, 160, {1}),
         (2, 8, {7, 8}),
@@ -286,15 +284,9 @@ def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("batches", "settings", "workers", "number"),
     [
-        (
-            Batches(4000, True, True),
-            300,
-            2,
-            1,
-        ),  # vehicles in a recorded scene take the same steps together
+        # Vehicles in a recorded scene take the same steps together.
         (Batches(4000, True, True), 1000, 8, 1),
         (Batches(4000, True, True), 1001, 2, 2),
-        (Batches(4000, True, True), 8000, 2, 8),
         (Batches(4000, True, True), 80_000, 2, 20),
         (
             Batches(4000, False, True),

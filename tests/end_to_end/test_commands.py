@@ -29,7 +29,7 @@ from tests.support.processes import written
 pytestmark = pytest.mark.usefixtures("small")
 
 
-@pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
+@pytest.mark.parametrize("study", ["rain", "native"])
 def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> None:
     run(f"simulate {study} --trace trace.csv")
     frame = pd.read_csv("trace.csv")

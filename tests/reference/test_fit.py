@@ -19,11 +19,10 @@ from safevar_sumo.questions.model_spread import (
     value_of,
     with_values,
 )
-from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.support.in_process import SLOW, InlinePool, write
+from tests.support.in_process import SLOW, write
 from tests.support.made_up import (
     SUN,
     changed,
@@ -203,27 +202,3 @@ def test_the_sets_are_simulated_one_by_one() -> None:
         3,
         sum(int(one.collided[0]) for one in alone),
     )
-
-
-@SLOW
-@pytest.mark.usefixtures("few_simulations")
-def test_the_end_over_fits_is_that_of_the_strictest_fitted_study() -> None:
-    gaps = [OWN, 6.4, 7.4]
-    study = load_study("sun", spread={GAP: gaps})
-    asked = {
-        "characteristics": ["tireFric"],
-        "unsafe": "below=1.5",
-        "pool": InlinePool(),
-    }
-    answer = tolerance(study, **asked)
-    own = tolerance(study, fits=0, **asked)
-    strictest = tolerance(with_values(study, {GAP: 6.4}), fits=0, **asked)
-    low, low_of_own, low_of_strictest = (
-        one.values("limits.alone_low")[0] for one in (answer, own, strictest)
-    )
-    assert low_of_own < low_of_strictest <= low <= low_of_strictest + 0.03, (
-        "rounded to the safe side"
-    )
-    assert answer.tables["fits"]["specified"].tolist() == ["kept"] * 3
-    assert answer.numbers["fits"] == 3
-    assert "fits" not in own.tables

@@ -362,10 +362,9 @@ def test_a_speed_that_disagrees_with_the_way_is_a_finding(
     ("reads", "told"),
     [
         ('{"decel": setting["decel"], "delay": 0}', "simulate never reads delay"),
-        ("{**setting}", "drac is undefined in all runs"),
         (
             '{"decel": setting.get("decel"), "delay": dict(setting)["delay"]}',
-            "drac is undefined",
+            "drac is undefined in all runs",
         ),
     ],
 )
@@ -413,18 +412,15 @@ def test_a_page_with_few_simulations_has_the_replay_with_the_fewest_changes(
     wall: Path,
 ) -> None:
     run("study wall.toml --out results --runs 1")
-    shown = list[tuple[int, int]]()
+    shown = list[int]()
     sv.report(
         "results",
         out="page.html",
         simulations=400,
-        progress=lambda _, done, total: shown.append((done, total)),
+        progress=lambda _, done, total: shown.append(total),
     )
     assert "Fewest changes: " in Path("page.html").read_text()
-    _, announced = shown[0]
-    assert {total for _, total in shown} == {announced}
-    assert shown[-1] == (announced, announced)
-    assert announced <= 400
+    assert max(shown) <= 400
 
 
 @SLOW
@@ -712,16 +708,9 @@ class Leaks(Rig):
 
 
 @SLOW
-@pytest.mark.parametrize(
-    "damage",
-    [
-        "threading.Thread(target=time.sleep, args=(999,)).start()",
-        "atexit.register(time.sleep, 999)",
-    ],
-)
-def test_threads_and_exit_functions_of_a_simulator_keep_no_command(
-    wall: Path, damage: str
-) -> None:
+def test_threads_and_exit_functions_of_a_simulator_keep_no_command(wall: Path) -> None:
+    thread = "threading.Thread(target=time.sleep, args=(999,)).start()"
+    damage = f"{thread}; atexit.register(time.sleep, 999)"
     choose("leaks:Leaks", LEAKS.replace("DAMAGE", damage))
     command = "study wall.toml --jobs 1 --out results"
     run_python("-m", "safevar_sumo", *command.split(), timeout=200)
@@ -875,19 +864,13 @@ def test_an_interrupted_question_of_another_simulator_begins_anew(
 
 @SLOW
 @pytest.mark.usefixtures("worker_processes")
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_a_study_repeats_three_settings_in_another_process(
-    wall: Path, jobs: int
-) -> None:
+def test_a_study_repeats_three_settings_in_another_process(wall: Path) -> None:
     """A hash of a text is the same in all workers, a process's number is not."""
-    options = f"study wall.toml --jobs {jobs} --out"
-    for value in ("1 + hash('a') % 9973", "1 + os.getpid() % 997"):
-        choose("reads:Reads", READS.replace("READ", value, 1))
-        if "pid" in value:
-            refused(f"{options} other", "in another process")
-        else:
-            run(f"{options} results")
-            assert "in a new process" in run("check wall.toml", expect=1).stdout
+    choose("reads:Reads", READS.replace("READ", "1 + hash('a') % 9973", 1))
+    run("study wall.toml --jobs 2 --out results")
+    assert "in a new process" in run("check wall.toml", expect=1).stdout
+    choose("reads:Reads", READS.replace("READ", "1 + os.getpid() % 997", 1))
+    refused("study wall.toml --jobs 1 --out other", "in another process")
 
 
 @SLOW

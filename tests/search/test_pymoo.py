@@ -54,7 +54,7 @@ def test_arguments_reach_the_algorithm() -> None:
         "pymoo:GA",
         *(
             pytest.param(f"pymoo:{name}", marks=SLOW)
-            for name in ("CMAES", "DE", "NSGA2", "MOEAD")
+            for name in ("CMAES", "NSGA2", "MOEAD")
         ),
     ],
 )

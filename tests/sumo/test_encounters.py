@@ -72,15 +72,10 @@ CASES = {
         {"model": "lead_vehicle_stopped"},
         {"distance": domain(40, 70)},
     ),
-    "far": (
-        "wear",
-        {"model": "crossing", "parameters": {"test": "CPFA"}},
-        {"speed": SPEED, "impact_location": PLACE},
-    ),
     "child": (
         "wear",
         {"model": "crossing", "parameters": {"test": "CPNCO"}},
-        {"speed": SPEED, "target_speed": domain(4, 7)},
+        {"speed": SPEED, "impact_location": PLACE, "target_speed": domain(4, 7)},
     ),
     "car": (
         "wear",
@@ -92,17 +87,17 @@ CASES = {
         {"model": "along"},
         {"speed": SPEED, "impact_location": PLACE, "target_speed": domain(3, 8)},
     ),
-    "stopped": (
-        "wear",
-        {"model": "car_to_car"},
-        {"speed": SPEED, "headway": domain(3, 5), "impact_location": PLACE},
-    ),
     "weather": ("wear", {"model": "crossing", "parameters": {"test": "CPFA"}}, {}),
     "mine": ("sun", {"model": "planted:Slope"}, {}),
     "brakes": (
         "wear",
         {"model": "car_to_car", "parameters": {"test": "CCRb"}},
-        {"speed": SPEED, "headway": domain(1, 2), "target_deceleration": domain(3, 6)},
+        {
+            "speed": SPEED,
+            "headway": domain(1, 2),
+            "impact_location": PLACE,
+            "target_deceleration": domain(3, 6),
+        },
     ),
 }
 

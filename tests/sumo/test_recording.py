@@ -263,12 +263,11 @@ def test_every_command_begins_with_the_reason(still: str) -> None:
         f"explain {still} --quick",
         f"simulate {still} --set mass=2600",
     ):
-        assert run(command).stdout.startswith(STANDS)
         answer = json_of(command)
+        assert answer["verdict"].startswith(STANDS)
         assert answer.get("numbers", answer)["driven"] is False
-    assert run(
-        f"study {still} --runs 1 --evaluations 20 --out results"
-    ).stdout.startswith(STANDS)
+    printed = run(f"study {still} --runs 1 --evaluations 20 --out results").stdout
+    assert printed.startswith(STANDS)
     run("report results --ask 'rules --samples 32 --unsafe collision' --out page.html")
     page = re.sub(
         "</?span>", "", Path("page.html").read_text()
