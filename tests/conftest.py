@@ -16,12 +16,12 @@ import pytest
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import local
 from safevar_sumo.plugins import ImportPath
-from safevar_sumo.questions import cases
+from safevar_sumo.questions import cases, repair
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Results, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
-from safevar_sumo.questions.repair import find, survivors
+from safevar_sumo.questions.repair import survivors
 from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.sumo.system import System
 from tests.support import in_process, planted_sled
@@ -163,7 +163,7 @@ def explained(case: Results) -> Answer:
 def quick_repairs(monkeypatch: pytest.MonkeyPatch) -> None:
     """A repair is searched with few simulations, and proved for 99 % of all vehicles."""
     monkeypatch.setattr(cases, "USUAL_BUDGET", 300)
-    monkeypatch.setattr(find, "SOBOL_VEHICLES", 32)
+    monkeypatch.setattr(repair, "SOBOL_VEHICLES", 32)
     monkeypatch.setattr(survivors, "MAX_SHARE_REPAIRED", 0.01)
 
 

@@ -16,10 +16,8 @@ from tools.manual import ROOT
 from tools.size import elements_in, sizes, sources_of
 
 LIMITS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
-DOUBLE = {"Search"}
+DOUBLE = {"Found", "Search"}
 """Names that still have several meanings."""
-OF_QUESTIONS = {"Plan", "search", "with_examples", "Found", "verdict_sentences", "tell"}
-"""Names that stand for the same step in several questions."""
 VERSIONS = {"FORMAT"}
 """Numbers that several modules have: each format of a file has its version."""
 COLLECTION = """
@@ -76,9 +74,7 @@ def test_a_public_name_is_defined_once() -> None:
         if "/web/" not in path:  # scripts that are exported with a simulation
             for name in public_names_in(source):
                 places[name].append(path)
-    assert {name for name, paths in places.items() if len(paths) > 1} == (
-        DOUBLE | OF_QUESTIONS
-    )
+    assert {name for name, paths in places.items() if len(paths) > 1} == DOUBLE
 
 
 def test_a_number_has_a_name_of_its_own() -> None:

@@ -1,6 +1,7 @@
 """A command writes the same bytes for any number of worker processes and any size of batches.
 
-An author of a question adds a row.
+An author of a question adds a row. `repair`, which takes minutes, is asked in
+`tests/questions/test_repair.py`.
 """
 
 from __future__ import annotations
@@ -23,8 +24,6 @@ QUESTIONS = {
     "risk": "small.toml --samples 300",
     "rules": "small.toml --samples 300",
     "compare": "small.toml smoke --samples 100",
-    "permit": "wear --point CPLA --set treadDepth=3 --others new --quick",
-    "repair": "autoware_july --promise brakeTorque>=0.9 --quick --fits 0",
 }
 """What each command is asked."""
 

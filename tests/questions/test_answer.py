@@ -31,7 +31,7 @@ from safevar_sumo.questions.answer import (
     with_interval,
 )
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
-from safevar_sumo.questions.permit.tell import SHOWN_WHOLE
+from safevar_sumo.questions.permit.answer import SHOWN_WHOLE
 from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
 from safevar_sumo.questions.sentence import Verdict, answer as said, note
 from safevar_sumo.questions.words import change_texts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -11,10 +12,29 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.questions import model_spread
 from safevar_sumo.report.page import report
-from tests.support.in_process import SLOW, InlinePool, run
+from tests.support.in_process import SLOW, InlinePool, rows_of, run
 
 
-@pytest.mark.usefixtures("few_simulations")
+@SLOW
+def test_a_rough_tolerance_calls_no_limit_kept() -> None:
+    """It says what was tested, and ends with code 3: a gate must not pass by it."""
+    asked = "tolerance smoke --quick --limits 'mass <= 2500' --unsafe collision --json"
+    done = run(asked, expect=3)
+    answer = json.loads(done.stdout)
+    assert answer["verdict"].startswith("Rough answer (--quick")
+    assert [answer["numbers"][name] for name in ("rough", "kept", "fits_tried")] == [
+        True,
+        None,
+        1,
+    ]
+    assert {row["kept"] for row in rows_of(answer, "limits")} == {None}
+    assert "confirms no limit" in done.stderr
+
+
+WORN = {"one": {"brakeTorque": 0.7}, "two": {"brakeTorque": 0.9}}
+
+
+@SLOW
 def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -22,9 +42,7 @@ def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
     monkeypatch.setattr(
         model_spread, "with_values", lambda *_: pytest.fail("another set")
     )
-    cars = {"one": {"brakeTorque": 0.7}, "two": {"brakeTorque": 0.9}}
-    options = {"others": "new", "point": "CPLA", "quick": True}
-    sv.permit("wear", cars=cars, pool=InlinePool(), **options)
+    sv.permit("wear", cars=WORN, others="new", quick=True, pool=InlinePool())
     price = (
         r"about [\d,]+ simulations, about 0:\d\d:\d\d; cars that fail early take fewer"
     )

@@ -10,7 +10,7 @@ from typing import Any
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.part import scope_of
-from safevar_sumo.questions.permit.tell import CARS
+from safevar_sumo.questions.permit.rows import CARS
 from safevar_sumo.questions.tolerance.tell import IN_RANGES
 from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.page import TEMPLATE_FOLDER

@@ -95,12 +95,12 @@ SAFE_WITHOUT_CONTACT = note(
 SAFE_WITH_DISTANCE = note(
     "{safe} means: the car keeps at least {below:g} m of clearance in {sets} of the vehicle model."
 )
-SAFE_WITH_CLEARANCE = note(
-    "{safe} means: the car keeps at least {keep:g} m of clearance."
-)
-SAFE_WITH_CLEARANCE_IN_OWN_SET = note(
-    "{safe} means: the car keeps at least {keep:g} m of clearance with parameter set 0 of the"
-    " vehicle model (that of the study). With the {others}, the car touches nobody."
+SAFE_WITH_CLEARANCE = (
+    note("{safe} means: the car keeps at least {keep:g} m of clearance."),
+    note(
+        "{safe} means: the car keeps at least {keep:g} m of clearance with parameter set 0 of the"
+        " vehicle model (that of the study). With the {others}, the car touches nobody."
+    ),
 )
 """The sentence for one parameter set, and the sentence for several."""
 TESTED = evidence(

@@ -12,8 +12,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.questions.braking import brake_onset
-from safevar_sumo.questions.repair.found import Price
-from safevar_sumo.records import FloatArray, NamedValues
+from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.scenarios import Point
 from safevar_sumo.study import MatrixTable, Study
 from safevar_sumo.sumo.encounters import encounter
@@ -25,10 +24,15 @@ NEEDLESS_BRAKE = 0.1
 only regulates the speed.
 """
 
+OF_BRAKING = ("metres_earlier", "metres_earlier_mean", "seconds_earlier", "most_at")
+"""Columns that say how much earlier a vehicle brakes, and at which point the difference is largest.
+"""
 
-def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> Price:
-    """The price of new values of parameters in comparison with today's values. `encounters` are the
-    new vehicle in K encounters, shape (K, n).
+
+def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonObject:
+    """The price of new values of parameters in comparison with today's values, by the names of the
+    answer's columns. Values of `OF_BRAKING` are None if the new vehicle brakes nowhere.
+    `encounters` are the new vehicle in K encounters, shape (K, n).
     """
     today = assemble(study)
     changed = assemble(with_parameters(study, values))
@@ -37,22 +41,24 @@ def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> Price
     benign = benign_scenes(study, today)
     needless_today = needless_braking(today, benign)
     needless = needless_braking(changed, benign)
-    price = Price(largest_deceleration=deceleration, benign_scenes=len(needless))
-    if needless:
-        price = price._replace(
-            needless_braking=sum(needless), needless_braking_today=sum(needless_today)
-        )
     metres, seconds = onsets_today - onsets
     braked = np.flatnonzero(np.isfinite(metres))
+    price = dict.fromkeys(OF_BRAKING)
     if len(braked):
         row = braked[np.argmax(metres[braked])]
-        price = price._replace(
-            metres_earlier=float(metres[row]),
-            seconds_earlier=float(seconds[row]),
-            most_at=today.points[row // len(encounters)].name or None,
-            metres_earlier_mean=float(np.mean(metres[braked])),
-        )
-    return price
+        point = today.points[row // len(encounters)].name or None
+        earlier = (metres[row], np.mean(metres[braked]), seconds[row])
+        price = dict(zip(OF_BRAKING, (*map(float, earlier), point), strict=True))
+    count = count_today = None
+    if needless:
+        count = sum(needless)
+        count_today = sum(needless_today)
+    return price | {
+        "largest_deceleration": deceleration,
+        "needless_braking": count,
+        "needless_braking_today": count_today,
+        "benign_scenes": len(needless),
+    }
 
 
 def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, float]:

@@ -8,13 +8,15 @@ from __future__ import annotations
 from safevar_sumo.questions.sentence import answer, condition, evidence, note
 
 # The repair, or the reason for none.
-NOT_NECESSARY = answer(
-    "No repair is necessary. With the present driving system, all tested vehicles within the"
-    " required wear {safe}."
-)
-NOT_NECESSARY_WHERE_REPAIRABLE = answer(
-    "No repair is necessary. With the present driving system, all tested vehicles within the"
-    " required wear that any driving system can keep safe {safe}."
+NOT_NECESSARY = (
+    answer(
+        "No repair is necessary. With the present driving system, all tested vehicles within the"
+        " required wear {safe}."
+    ),
+    answer(
+        "No repair is necessary. With the present driving system, all tested vehicles within the"
+        " required wear that any driving system can keep safe {safe}."
+    ),
 )
 """The first sentence is for a promise in which full braking keeps all vehicles safe; the second
 sentence is for any other promise.
@@ -62,7 +64,7 @@ PROOF = evidence(
     " vehicles are unsafe)."
 )
 SETS = evidence(
-    "The answer holds in {holding} of {sets} parameter sets of the vehicle model (alternative"
+    "The answer holds in {fits} of {number} parameter sets of the vehicle model (alternative"
     " calibrations), each with a search for a counterexample (an unsafe vehicle within the"
     " required wear)."
 )

@@ -17,12 +17,12 @@ import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.questions.permit.permits import cars_of
-from safevar_sumo.questions.permit.speed_search import Cars
+from safevar_sumo.questions.permit.rows import assumed_cells, assumed_sentences
+from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.support.in_process import SLOW
-from tests.support.made_up_studies import places
 
 JOINT = with_ranges(sv.load_study("wear"))
 VEHICLE = CharacteristicSet.of(JOINT).vehicle
@@ -137,6 +137,28 @@ def test_what_is_not_measured_is_as_the_study_states_and_as_new_only_if_the_user
     assert fleet.measured.sum() == 2
 
 
+def test_what_is_assumed_is_named_with_its_value_and_where_that_is_from() -> None:
+    frame = pd.DataFrame(
+        {"car": ["a", "b"], "treadDepth": [3, None], "sensorRange": [20, 30]}
+    )
+    fleet = read(frame, others="new")
+    own = "brakeTorque 1, brakeResponse 0.2 s, payload 75 kg, payloadCentre 2.6 m"
+    assert assumed_cells(VEHICLE, fleet) == [
+        f"{own}, sensorLatency 0.1 s",
+        f"treadDepth 8 mm, {own}, sensorLatency 0.1 s",
+    ]
+    assert Verdict(assumed_sentences(JOINT, VEHICLE, fleet)) == (
+        "This answer assumes values that were not measured, as the study states under [unmeasured]:"
+        " brake actuator delay 0.2 s, longitudinal position of the payload 2.6 m and perception"
+        " latency 0.1 s. This answer assumes values that were not measured, as in a new car:"
+        " relative brake torque 1 and payload 75 kg. In 1 of 2 cars, further values are assumed,"
+        ' which the column "assumed" names (--details).'
+    )
+    whole = read({"a": VEHICLE.named(VEHICLE.original)})
+    assert not any(assumed_sentences(JOINT, VEHICLE, whole))
+    assert assumed_cells(VEHICLE, whole) == [None]
+
+
 def test_a_written_answer_is_read_as_the_list_that_it_is_about() -> None:
     frame = pd.DataFrame({"plate": ["a"], "treadDepth": ["3,5"]})
     for text, is_rough in (("yes", True), ("no", False)):
@@ -162,13 +184,6 @@ def test_a_measured_value_may_be_any_within_its_precision_and_the_domain() -> No
         assert (cars.lower[column], cars.upper[column]) == (low, high)
         assert {*cars.vehicles[:, column]} == {low, high}
         assert (cars.vehicles[:, others] == setting[others]).all()
-
-
-def test_all_corners_of_five_measured_values_drive_the_grid() -> None:
-    """16 of 32 corners meet each encounter."""
-    cars = Cars.measured(np.zeros(5), np.ones(5))
-    met = cars.drives_in(places(*np.arange(9.0))).vehicle
-    assert (len(met), len(np.unique(met, axis=0))) == (9 * 16, 32)
 
 
 HEAD = "car,treadDepth,brakeTorque,payload\n"

@@ -15,7 +15,7 @@ import safevar_sumo as sv
 from safevar_sumo.campaign import batches
 from safevar_sumo.questions import models
 from safevar_sumo.study import Study
-from tests.support.in_process import InlinePool, json_of, refused, run, write
+from tests.support.in_process import InlinePool, json_of, refused, rows_of, run, write
 
 CARS = """
 from typing import Annotated
@@ -215,7 +215,13 @@ def test_each_car_of_a_list_reaches_the_speed_of_the_formula() -> None:
             assert pd.isna(row["repair_first"])
     assert {*rows["new_car_up_to"]} == {new}
     assert rows["up_to"].dropna().is_monotonic_increasing
-    assert answer.numbers["not_driven_above"] == 16
+    numbers = answer.numbers
+    assert rows["verdict"].value_counts().to_dict() == {
+        "drive": numbers["drive"],
+        "up to": numbers["limited"],
+        "stop": numbers["stop"],
+    }
+    assert (numbers["cars"], numbers["not_driven_above"]) == (len(CAR_LIST), 16)
     assert "fast" in answer.verdict, "a test that was left out"
 
 
@@ -254,6 +260,9 @@ def test_the_assumed_value_that_matters_most_is_that_of_the_formula() -> None:
         }
         worst = min(failing, key=lambda name: failing[name])
         assert row["assumed_matters_most"] == worst
+        assert f"unsafe already at {failing[worst]:g} m/s" in answer.verdict
+        for name in failing:
+            assert f"{name} {NEW[name]:g}" in row["assumed"]
 
 
 def test_a_needed_speed_decides_the_exit_code() -> None:
@@ -267,6 +276,11 @@ def test_a_needed_speed_decides_the_exit_code() -> None:
     for need, code, fast in ((least, 0, 2), (least + 1, 3, 1)):
         answer = json_of(typed, "--need", f"{need:g} m/s", expect=code)
         assert (answer["numbers"]["drive"], answer["numbers"]["need"]) == (fast, need)
+    quick = json_of(typed, "--need", f"{least:g} m/s", "--quick", expect=3)
+    assert quick["numbers"]["rough"], "a rough answer lets no car drive"
+    assert (quick["numbers"]["drive"], quick["numbers"]["attacked"]) == (0, 0)
+    reached = [row["up_to"] for row in rows_of(quick, "cars")]
+    assert reached == [row["up_to"] for row in rows_of(answer, "cars")]
     refused(f"{typed} --need '17 m/s'", "need", "16 m/s")
     refused(f"{typed} --need '10 km/h'", "need")
 
@@ -281,17 +295,13 @@ def test_a_needed_speed_decides_the_exit_code() -> None:
     refused(f"{typed} --quick --out rough.csv", "quick", "rough")
 
 
-def test_between_two_speeds_of_the_grid_a_failure_counts_in_any_list() -> None:
+def test_between_two_speeds_of_the_grid_a_failure_counts() -> None:
     """No multiple of 1 m/s is unsafe; and between the ends of a measured value."""
     measured = f"upper = 9, precision = {{ value = {WEAKER}, source = 'test' }}"
     study = STUDY.replace("cars:Car", "cars:Shaky") + TESTS
     study = study.replace("upper = 9", measured)
-    both = asked(study, cars={"a": {}, "b": {"decel": 7.5}}, pool=InlinePool(2))
-    cars = both.tables["cars"]
-    assert cars.set_index("car")["up_to"].to_dict() == {"a": 13, "b": 9}
-    alone = asked(study, cars={"b": {"decel": 7.5}}).tables["cars"]
-    own, alone = (table.set_index("car").loc["b"].dropna() for table in (cars, alone))
-    pd.testing.assert_series_equal(own, alone)
+    assert row_of(study, {"decel": 7.5})["up_to"] == 9
+    assert row_of(study, {})["up_to"] == 13
     rough = row_of(study, {}, quick=True)
     assert (rough["up_to"], rough["verdict"]) == (expected({}).up_to, "up to")
 

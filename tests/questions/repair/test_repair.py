@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from msgspec.structs import replace as replace_in
 from numpy.random import default_rng
@@ -17,27 +18,60 @@ import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions import cases
+from safevar_sumo.questions import cases, repair as question
 from safevar_sumo.questions.drives import Drives, Judged
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.repair import smallest, write_repair
-from safevar_sumo.questions.repair.price import benign_scenes, price_of
+from safevar_sumo.questions.repair import (
+    smallest,
+    survivors,
+    write_repair,
+)
+from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.questions.repair.problem import (
     Parameter,
     Promise,
     RepairProblem,
     parameters_of,
 )
+from safevar_sumo.questions.tables import AnswerTable
 from safevar_sumo.records import BoolArray, FloatArray, differences
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.support.in_process import SLOW, InlinePool, rows_of
 from tests.support.made_up_studies import places
-from tests.support.planted_sled import GAP_TODAY, MARGIN, STUDY
+from tests.support.planted_sled import GAP_TODAY, MARGIN, SPEED, STUDY
 
 pytestmark = pytest.mark.usefixtures("made_up_studies")
+
+
+def gap_for(grip: float) -> float:
+    """The gap at which a sled has to brake so that it stops `MARGIN` before the obstacle."""
+    return MARGIN + SPEED**2 / (2 * grip)
+
+
+@SLOW
+def test_repair_and_price_of_a_planted_system_equal_the_closed_form(
+    planted: Path,
+) -> None:
+    found = sv.repair(planted, change=["gap", "colour"], pool=InlinePool(2))
+    (repair,) = rows_of(found.to_dict(), "repairs")
+    needed = max(
+        gap_for(5), gap_for(5 * 0.9) - MARGIN
+    )  # another fit than the study's own needs not to collide
+    assert repair["parameters"] == {"gap": pytest.approx(needed, rel=0.01)}
+    assert repair["fits"] == found.numbers["fits"] == found.numbers["fits_tried"] == 3
+    assert "answer holds in 3 of 3 parameter sets of the vehicle model" in found.tested
+    assert [repair["metres_earlier"]] == found.values("repairs.metres_earlier_mean")
+    assert repair["metres_earlier"] == pytest.approx(needed - GAP_TODAY, rel=0.01)
+    assert (
+        len(str(repair["parameters"]["gap"])) <= 5
+    )  # four digits: what is printed is what was tried
+    assert repair["proof_failures"] == 0
+    assert repair["at_most"] <= 0.01
+    table = found.render("text").split("Repairs\n")[1].split("Tested: ")[0]
+    assert max(map(len, table.splitlines())) <= 100
 
 
 @SLOW
@@ -68,15 +102,16 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
     )
 
 
-def test_the_price_of_a_planted_system_is_the_closed_form(planted: Path) -> None:
-    study = sv.load_study(planted)
-    new_vehicle = assemble(study).characteristics.original_settings
-    earlier = price_of(study, {"gap": 45.0}, new_vehicle)
-    assert earlier.metres_earlier == earlier.metres_earlier_mean
-    assert earlier.metres_earlier == pytest.approx(45 - GAP_TODAY, rel=0.01)
-    always = price_of(study, {"always": 1.0}, new_vehicle)
-    assert always.needless_braking == always.benign_scenes >= 6
-    assert always.needless_braking_today == 0
+@SLOW
+def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -> None:
+    answers = [
+        sv.repair(planted, change=["always"], pool=pool).to_dict()
+        for pool in (InlinePool(), InlinePool(2))
+    ]
+    assert answers[0] == answers[1]
+    (repair,) = rows_of(answers[0], "repairs")
+    assert repair["needless_braking"] == repair["benign_scenes"] >= 6
+    assert repair["needless_braking_today"] == 0
 
 
 class Adding:
@@ -164,14 +199,31 @@ def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
     assert Parameter("a", row, 1000.0).values(np.array([0.45678])).item() == 1000.457
 
 
-def test_a_study_with_a_repair_is_written_also_without_a_file_to_extend(
-    tmp_path: Path,
+def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    """Without attacks and fresh wear: of the worst brakes promised, those in between and the
+    best.
+    """
+    monkeypatch.setattr(question, "SOBOL_VEHICLES", 3)
+    monkeypatch.setattr(survivors, "find_failures", lambda *_: [])
+    monkeypatch.setattr(
+        survivors, "prove_change", lambda *_: (survivors.Proof(5, 0, 0.45, 0), [])
+    )
     out = tmp_path / "it.toml"
-    native = sv.load_study("native")
-    # A study that results alone hold has no file.
-    for study in (native, replace_in(native, name="lost")):
-        write_repair(out, study, {"standing_gap": 3.25}, "It is repaired.")
+    kept = sv.repair("native", promise=["decel>=7"], out=str(out), pool=InlinePool())
+    assert not out.exists(), "there is no repair to write"
+    worst = kept.numbers["worst_today"]
+    assert worst == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
+    words = f"{worst:.2f} m from centre to centre (gap {worst - 4.7:.2f} m)"
+    assert f"The worst vehicle has a safety degree of {words}." in kept.verdict
+    assert (
+        "None of 5 worn vehicles that were sampled afterwards is unsafe" in kept.tested
+    )
+    table = AnswerTable(pd.DataFrame({"parameters": [{"standing_gap": 3.25}]}))
+    # A study that results alone hold has no file to extend.
+    for study in (kept.study, replace_in(kept.study, name="lost")):
+        write_repair(out, replace(kept, study=study, tables={"repairs": table}))
         assert sv.load_study(out).ads.parameters["standing_gap"] == 3.25
 
 

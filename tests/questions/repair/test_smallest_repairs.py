@@ -17,8 +17,7 @@ from safevar_sumo.questions import repair as question
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.between import AT_ONE_PHASE
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.repair import find
-from safevar_sumo.questions.repair.found import Price
+from safevar_sumo.questions.repair import answer as answers
 from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.study import CharacteristicTable, FreeParameter, Study
 from tests.support.in_process import InlinePool
@@ -93,18 +92,27 @@ def planted(gap: float = 12.0, most: float = 64.0) -> Study:
     )
 
 
-def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> Price:
+def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonObject:
     """A price: `more` costs less than `gap`, and who always brakes does so needlessly."""
     today = study.ads.parameters
     earlier = values.get("gap", today["gap"]) - today["gap"]
     earlier += 0.5 * values.get("more", 0.0)
     needless = 4 if values.get("always", 0.0) >= 0.5 else 0
-    return Price(8.0, 4, needless, 0, metres_earlier=earlier)
+    return {
+        "metres_earlier": earlier,
+        "metres_earlier_mean": earlier,
+        "seconds_earlier": earlier / SPEED,
+        "most_at": None,
+        "largest_deceleration": 8.0,
+        "needless_braking": needless,
+        "needless_braking_today": 0,
+        "benign_scenes": 4,
+    }
 
 
 @pytest.fixture(autouse=True)
 def _made_up_price(quick_repairs: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(find, "price_of", price_of)
+    monkeypatch.setattr(answers, "price_of", price_of)
 
 
 def repaired(study: Study, **options: Any) -> Answer:
@@ -175,6 +183,13 @@ def test_a_promise_that_is_kept_today_needs_no_repair(above: float) -> None:
     assert answer.numbers["kept_today"] == (above >= 0)
     assert answer.numbers["repairs"] == len(rows_of(answer)) == (above < 0)
     assert answer.numbers["worst_today"] == pytest.approx(today - braking_way(5))
+
+
+def test_no_repair_is_found_where_no_value_suffices() -> None:
+    study = planted(most=NEEDED - 0.1)
+    answer = repaired(study, promise=GRIP, change=["gap"], fits=0)
+    assert answer.numbers["repairs"] == len(rows_of(answer)) == 0
+    assert (answer.numbers["kept_today"], answer.numbers["fits"]) == (False, 0)
 
 
 def test_sets_in_which_no_repair_holds_are_named() -> None:
