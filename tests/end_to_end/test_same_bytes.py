@@ -52,7 +52,7 @@ MIXED = ["nsga2", "surrogate", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
 @SLOW
 @pytest.mark.parametrize(
     ("algorithms", "workers", "batch", "breaks_after"),
-    [(OURS, 7, None, None), (OURS, 3, 3, None), (OURS, 2, 1, None), (MIXED, 1, 11, 9)],
+    [(OURS, 3, 3, None), (OURS, 2, 1, None), (MIXED, 1, 11, 9)],
 )
 def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches_nor_on_an_interruption(
     algorithms: list[str],

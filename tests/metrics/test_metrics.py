@@ -79,7 +79,7 @@ def test_safety_degree_is_the_distance_at_standstill_or_minus_the_speed_of_the_c
 
 @pytest.mark.parametrize(
     ("speed_of_the_struck", "degree"),
-    [(2.5, -1.0), (-1.0, -4.5), (3.5, -0.001), (9.0, -0.001)],
+    [(2.5, -1.0), (-1.0, -4.5), (9.0, -0.001)],
 )
 def test_severity_is_the_closing_speed_and_every_collision_is_below_0(
     speed_of_the_struck: float, degree: float
@@ -321,7 +321,6 @@ def test_each_vehicle_counts_for_itself_to_the_bit_and_says_if_on_a_collision(
 @pytest.mark.parametrize(
     ("unsafe", "outcome", "degree", "words"),
     [
-        (Unsafe(), Outcome.COLLISION, -3.214, "collides at 3.21 m/s"),
         (Unsafe(keep=0.3), Outcome.COLLISION, -3.214, "collides at 3.21 m/s"),
         (
             Unsafe(keep=0.3),
@@ -341,6 +340,7 @@ def test_each_vehicle_counts_for_itself_to_the_bit_and_says_if_on_a_collision(
             0.8,
             "has a safety degree of 0.8 m, below 1.4 m",
         ),
+        (Unsafe(degree=1.4), Outcome.COLLISION, -2.0, "collides at 2.00 m/s"),
         (
             Unsafe(below=1.4),
             Outcome.STOPPED,
