@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 import shlex
 import textwrap
+from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
@@ -221,7 +222,9 @@ def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(
     # The usual questions where they take little time, as none has an answer.
     ask = "" if name == "stop" else '--ask "rules --samples 16"'
     answered(f"evidence results {ask} --out it.zip", must=True)
-    run("verify it.zip --run-code")
+    for file in ("kind.toml", "walk.toml", "walk.csv"):  # which a pack holds
+        Path(file).unlink()
+    run(f"verify it.zip {'--run-code' if name == 'rig' else ''}")
 
 
 @SLOW
