@@ -54,7 +54,7 @@ def where_original_is_safe(worlds: Sequence[DrivenWorld], unsafe: Unsafe) -> Rul
             world = worlds[number]
             if world.test is not None:
                 model = world.model
-                original = model.characteristics.vehicle.original[np.newaxis]
+                original = model.characteristics.vehicle.original_settings
                 drives = Drives.product(original, encounters[rows])
                 runs = model.evaluator.evaluate(world.settings(drives), stage)
                 is_safe[rows] = runs.valid & ~unsafe.of(runs)
