@@ -66,43 +66,29 @@ class Contents(NamedTuple):
         """The same names, but with the study's `measures` in place of `...` among the numbers."""
         return self._replace(numbers=[*_without_ellipsis(self.numbers), *measures])
 
-    def has(self, key: str) -> bool:
-        """Whether an answer may have a key: `number`, `number.index` or `table.column`. An index
-        into a list may be of any size.
+    def check_key(self, key: str) -> None:
+        """Refuse a key that `Answer.values` would not know; raises an InputError. An index into a
+        list may be of any size.
         """
+        # A key is `number`, `number.index` or `table.column`.
         name, _, ending = key.rpartition(".")
         names = self.numbers
         number = key
+        # The columns of all tables would fill the screen.
+        legal = _without_ellipsis(names)
+        legal += [f"{table}.COLUMN" for table in self.tables]
         if name in self.tables:
             names = self.tables[name]
             number = ending
+            legal = [f"{name}.{column}" for column in _without_ellipsis(names)]
         elif name and ending.isdecimal():
             number = name
-        return ... in names or number in names
-
-    def check_key(self, key: str) -> None:
-        """Refuse a key that `Answer.values` would not know; raises an InputError."""
-        if self.has(key):
-            return
-        # The columns of all tables would fill the screen.
-        legal = _without_ellipsis(self.numbers)
-        legal += [f"{table}.COLUMN" for table in self.tables]
-        table = key.rpartition(".")[0]
-        if table in self.tables:
-            columns = _without_ellipsis(self.tables[table])
-            legal = [f"{table}.{column}" for column in columns]
-        raise InputError(
-            "fail_if",
-            f"the answer has no number {key!r}{did_you_mean(key, self.keys)}",
-            one_of(legal),
-        )
-
-    def check_answer(self, answer: Answer) -> None:
-        """Refuse an answer with names that are not declared; raises an InputError."""
-        for key in answer.contents.keys:
-            if not self.has(key):
-                problem = f"the answer has {key!r}, which its question does not declare"
-                raise InputError(answer.question, problem, "names in @contents")
+        if ... not in names and number not in names:
+            raise InputError(
+                "fail_if",
+                f"the answer has no number {key!r}{did_you_mean(key, self.keys)}",
+                one_of(legal),
+            )
 
     @property
     def keys(self) -> list[str]:
@@ -129,8 +115,7 @@ def contents(
     **tables: DeclaredNames,
 ) -> Callable[[AnswerFunction], AnswerFunction]:
     """Decorator that declares the `Contents` of a function's answers: the names of numbers, and the
-    names of columns by table. The command refuses other names before it computes anything, and an
-    answer with other names is an error.
+    names of columns by table. The command refuses other names before it computes anything.
 
     `lead` is the table that one screen shows, `next` the question that a user should ask next.
     `OF_ALL` are always among the numbers.
@@ -140,18 +125,15 @@ def contents(
             "contents", f"lead = {lead!r} is no table that it declares", lead, tables
         )
 
-    names = tuple(dict.fromkeys((*OF_ALL, *numbers)))
-    declared = Contents(names, tables, lead, next)
-
     def declare(function: AnswerFunction) -> AnswerFunction:
         @wraps(function)
         def with_lead(*arguments: Any, **options: Any) -> Answer:
             """The function, whose answer gets the declared leading table if it states none."""
             answer = function(*arguments, **options)
-            declared.check_answer(answer)
             return replace(answer, lead=lead if answer.lead == "" else answer.lead)
 
-        vars(with_lead)["contents"] = declared
+        names = tuple(dict.fromkeys((*OF_ALL, *numbers)))
+        vars(with_lead)["contents"] = Contents(names, tables, lead, next)
         return cast("AnswerFunction", with_lead)
 
     return declare
@@ -231,14 +213,6 @@ class Answer:
             raise InputError("numbers", repr(self.numbers), "a mapping of names")
         if not isinstance(self.tables, Frames):
             object.__setattr__(self, "tables", Frames(self.tables))
-
-    @property
-    def contents(self) -> Contents:
-        """The names of the answer's numbers and columns."""
-        columns = {}
-        for name, frame in self.tables.items():
-            columns[name] = [str(column) for column in frame]
-        return Contents(self.numbers, columns)
 
     def to_dict(self) -> JsonObject:
         """The answer as plain values for JSON: question, study, verdict, numbers, and the columns
@@ -327,7 +301,8 @@ class Answer:
         InputError
             If there is no such number.
         """
-        self.contents.check_key(key)
+        columns = {name: list(map(str, frame)) for name, frame in self.tables.items()}
+        Contents(self.numbers, columns).check_key(key)
         name, _, ending = key.rpartition(".")
         if name in self.tables:
             return list(plain(self.tables[name][ending].tolist()))

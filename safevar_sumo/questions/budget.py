@@ -9,19 +9,33 @@ stage asks once how much it may simulate:
 - `by_effort` gives a usual number times the effort, which is 1, less with `--quick`, and more if
   the user allows more simulations than are usual;
 - `of_stage` also gives no more than a part of few simulations that are left.
+
+How long a slow simulation takes is measured before.
 """
 
 from __future__ import annotations
 
 import sys
+import time
 from dataclasses import dataclass
 from datetime import timedelta
 
+import numpy as np
 from rich.console import Console
 
-from safevar_sumo.campaign.batches import spare
+from safevar_sumo.campaign.batches import forget_other, spare
+from safevar_sumo.campaign.evaluation import (
+    Selection,
+    Task,
+    carry_out,
+    evaluate_settings,
+)
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import significant
+from safevar_sumo.records import Evaluations, FloatArray, significant
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.simulators import simulations_of_setting
+from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import print_text
 
 LONGEST_QUESTION = 900.0
@@ -46,6 +60,10 @@ MOST_EFFORT = 8.0
 """Largest effort if the user allows more simulations than are usual."""
 TOTAL_DIGITS = 2
 """Number of digits to which a number of simulations is rounded that is derived from a time."""
+MEASURED = 2
+"""Number of simulations by which the duration of a simulation is measured."""
+TIMED_VEHICLES = 512
+"""Number of vehicles in the batch that measures how long a vehicle of a list takes."""
 
 
 @dataclass
@@ -230,3 +248,42 @@ def price_in_words(simulations: float, seconds: float) -> str:
     """Words for a number of simulations and for their duration. One takes `seconds`."""
     duration = timedelta(seconds=round(simulations * seconds))
     return f"about {simulations:,.0f} simulations, about {duration}"
+
+
+def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | None:
+    """The mean duration of a simulation if all workers simulate at the same time [s]. The result is
+    None if a simulation takes milliseconds, as in SUMO.
+
+    The original vehicle is simulated `MEASURED` times. Results that an interrupted command has
+    stored are forgotten if the original vehicle drives in another way now.
+    """
+    if not system.mover.takes_long:
+        return None
+    settings = system.characteristics.original_settings
+    original, seconds = _timed(Task(study=study), settings, pool)
+    if system.repeats == 1 and not original.failed[0]:
+        forget_other(study, pool, original)
+    return seconds / (pool.workers * simulations_of_setting(system))
+
+
+def print_price_of_list(
+    study: Study, system: System, pool: Pool, simulations: float
+) -> None:
+    """Print how long a list of vehicles takes. The duration is measured with a batch of vehicles at
+    one point. It limits nothing, and the budget does not count the measured simulations.
+    """
+    task = Task(study=study, selection=Selection(points=(len(system.points) // 2,)))
+    batch = np.repeat(system.characteristics.original_settings, TIMED_VEHICLES, axis=0)
+    _, seconds = _timed(task, batch, pool)
+    price = price_in_words(simulations, seconds / (TIMED_VEHICLES * pool.workers))
+    print_text(Console(file=sys.stderr), f"{price}; cars that fail early take fewer")
+
+
+def _timed(task: Task, settings: FloatArray, pool: Pool) -> tuple[Evaluations, float]:
+    """The evaluations of settings, and the time that one worker takes for all of them [s]."""
+    jobs = [(task, settings)]
+    # The first simulations start a worker and its simulator: their time does not count.
+    carry_out(evaluate_settings, jobs, pool)
+    start = time.perf_counter()
+    (evaluations,) = carry_out(evaluate_settings, jobs, pool)
+    return evaluations, time.perf_counter() - start

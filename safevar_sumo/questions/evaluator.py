@@ -35,13 +35,15 @@ from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, Unsafe
 from safevar_sumo.questions.between import in_phases
-from safevar_sumo.questions.budget import QUICK_EFFORTS, QUICK_SECONDS, Budget
-from safevar_sumo.questions.case import Results, Subject
-from safevar_sumo.questions.price import (
+from safevar_sumo.questions.budget import (
     MEASURED,
+    QUICK_EFFORTS,
+    QUICK_SECONDS,
+    Budget,
     print_price_of_list,
     seconds_of_simulation,
 )
+from safevar_sumo.questions.case import Results, Subject
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.questions.tally import Tally

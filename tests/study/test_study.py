@@ -28,9 +28,9 @@ from safevar_sumo.study import (
     tables_of,
     write_study,
 )
-from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
 from tests.support.in_process import write
+from tools.study_schema import schema_text
 
 VALIDATOR = jsonschema.Draft7Validator(json.loads(STUDY_SCHEMA.read_text()))
 

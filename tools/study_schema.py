@@ -1,5 +1,5 @@
-"""The JSON schema of study files, for editors. `python -m safevar_sumo.study.file_schema` writes
-the shipped file again.
+"""The JSON schema of study files, for editors. `python -m tools.study_schema` writes the
+shipped file again.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import json
 import msgspec
 
 from safevar_sumo.shipped import STUDY_SCHEMA
-from safevar_sumo.study.schema import Study
+from safevar_sumo.study import Study
 
 EXTENDS = {
     "type": "string",
