@@ -11,7 +11,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
-from safevar_sumo.errors import MAX_JOBS, InputError, check_name, check_text
+from safevar_sumo.errors import MAX_JOBS, InputError, check_text
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.arguments import FLAG, check_kind
 
@@ -140,10 +140,7 @@ class Option(NamedTuple):
             return Unsafe.parse(value)
         if self.metavar == CARS_FILE and not isinstance(value, str):
             return value
-        text = check_text(self.name, value)
-        if self.choices:
-            check_name(self.name, repr(text), text, self.choices)
-        return text
+        return check_text(self.name, value)
 
     def _number(self, value: Any) -> Any:
         """The value of an option that takes a number within `limits`."""

@@ -21,7 +21,6 @@ from msgspec.structs import replace as replace_in
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import commands
-from safevar_sumo.errors import InputError
 from safevar_sumo.questions.answer import (
     Answer,
     Column,
@@ -62,12 +61,6 @@ ANSWER = Answer(
     },
     tables=TABLES,
 )
-
-
-def test_an_answer_with_a_name_that_its_question_does_not_declare_is_an_error() -> None:
-    declaring = contents("probability", "interval", parts=("part", "age"))
-    with pytest.raises(InputError, match=r"parts: the answer has 'parts\.length'"):
-        declaring(lambda: ANSWER)()
 
 
 def test_json_names_units_and_meanings_and_has_no_value_where_none_is_defined() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions import budget, price
+from safevar_sumo.questions import budget
 from safevar_sumo.questions.between import AT_ONE_PHASE
 from safevar_sumo.questions.budget import Budget, round_down
 from tests.support.in_process import SLOW, InlinePool, refused, run, write
@@ -68,7 +68,7 @@ def test_the_least_number_is_told_before_anything_is_simulated(
     rig: str, question: str, least: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert getattr(sv, question)(rig, simulations=least, pool=InlinePool()).verdict
-    monkeypatch.setattr(price, "carry_out", lambda *_: pytest.fail("it was simulated"))
+    monkeypatch.setattr(budget, "carry_out", lambda *_: pytest.fail("it was simulated"))
     with pytest.raises(InputError, match=f"an answer takes at least {least}"):
         getattr(sv, question)(rig, simulations=least - 1, pool=InlinePool())
 

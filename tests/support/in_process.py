@@ -24,9 +24,10 @@ import pytest
 
 from safevar_sumo.campaign import all_runs, evaluation, local, run_campaign
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.cli.program import run_command_line
+from safevar_sumo.cli.program import COMMANDS, command_function, run_command_line
 from safevar_sumo.errors import INTERRUPTS
 from safevar_sumo.questions import cases
+from safevar_sumo.questions.answer import Contents, contents_of
 from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.records import FloatArray
 from safevar_sumo.shipped import NETWORKS
@@ -196,8 +197,17 @@ def run_python(*arguments: str, expect: int = 0, **options: Any) -> CommandOutpu
 
 
 def json_of(typed: str, *arguments: str, expect: int = 0) -> Any:
-    """The JSON that a command prints."""
-    return json.loads(run(typed, *arguments, "--json", expect=expect).stdout)
+    """The JSON that a command prints. A question has declared all names in it."""
+    answer = json.loads(run(typed, *arguments, "--json", expect=expect).stdout)
+    if answer["question"] in COMMANDS:
+        declared = contents_of(command_function(answer["question"]))
+        assert declared is not None
+        tables = {
+            name: list(table["columns"]) for name, table in answer["tables"].items()
+        }
+        for key in Contents(answer["numbers"], tables).keys:
+            declared.check_key(key)
+    return answer
 
 
 def rows_of(answer: Any, table: str) -> Any:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-MARGIN, GAP_TODAY = 0.3, 12.0
-"""The clearance to keep and today's gap [m]. This gap lets even a new sled collide, so that the
-price of every promise, at least 10 m, is far longer than the 0.2 m of a step.
+SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
+"""The speed [m/s], the clearance to keep and today's gap [m]. This gap lets even a new sled
+collide, so that the price of every promise, at least 10 m, is far longer than the 0.2 m of a step.
 """
 MODELS = """
 import numpy as np

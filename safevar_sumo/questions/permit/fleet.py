@@ -152,7 +152,7 @@ def read_fleet(
     # which the file repeats, may still have decimal commas: hence the separator is ",;".
     written = {*answer_columns} - {CAR}
     header = [text.strip() for text in cells.header]
-    is_answer = bool(written) and written <= {*header}
+    is_answer = bool(written) and written.issubset(header)
     if is_answer:
         cells = cells._replace(separator=",;", header=header)
         ignore = [*ignore, *written]

@@ -242,12 +242,10 @@ def test_all_bad_cells_are_in_one_message_and_none_has_the_end_of_a_domain_as_ad
 
 def test_options_and_constraints_are_refused_too(tmp_path: Path) -> None:
     path = written(tmp_path, HEAD + "a,3,1,75\nb,3,1,525\n")
-    for told, options in (
-        ("there is no such column; did you mean 'payload'?", {"ignore": ["payloa"]}),
-        ("--others: 'old'", {"others": "old"}),
-    ):
-        with pytest.raises(InputError, match=re.escape(told)):
-            read(path, **options)
+    with pytest.raises(InputError, match="no such column; did you mean 'payload'"):
+        read(path, ignore=["payloa"])
+    with pytest.raises(InputError, match="--others: 'old'"):
+        read(path, others="old")
     told = r"line 3: violates a constraint: payload - 100 payloadCentre = 385 kg"
     with pytest.raises(InputError, match=told):
         read(path, study=BOUND, others="new")
