@@ -2,9 +2,8 @@
 
 The package is installed alone into a new environment, as README says, without extras or packages of
 the tests; this file needs none either. Commands run in empty directories with a new home. They are
-those of README and of `PAGES`, as printed there. But the questions of `QUICK` get a quick answer,
-and blocks that tests shorten are left out. What README's table of questions quotes must be part of
-what its command prints. What needs an extra must name it in two lines.
+those of README and of `PAGES`, as printed there. What README's table of questions quotes must be
+part of what its command prints. What needs an extra must name it in two lines.
 """
 
 from __future__ import annotations
@@ -31,8 +30,6 @@ PAGES = {
     "docs/trust.md": ("validate", "import"),
 }
 """Pages, and the commands of each that run, in its order."""
-QUICK = ("tolerance", "report")
-"""Questions that get a quick answer, which has what README quotes of a whole one, too."""
 SOLUTIONS = "results/rain/solutions.csv"
 """Solutions of README's study; some of them stand in for the published files of a page."""
 PUBLISHED = {
@@ -134,11 +131,10 @@ def read_me(machine: Machine) -> None:
     for block in blocks("README.md"):
         if block.title:
             (machine.folder / "readme" / block.title).write_text(block.text)
-        elif block.language == "bash" and not block.comment.startswith("in tests"):
+        elif block.language == "bash":
             for line in block.text.splitlines():
                 machine.run(line, "checkout" if line.startswith("pip") else "readme")
-    for question, example in questions():
-        command = f"{question} --quick" if question.startswith(QUICK) else question
+    for command, example in questions():
         printed = machine.run(PROGRAM + command, "readme", ANSWERS)
         quotes = re.findall('"(.+?)"', example)
         if not quotes:

@@ -109,6 +109,14 @@ NOT_SIMULATED = note("Not simulated: {parts}.")
 """Notes on the criterion that a study states: its source, and the parts that are not simulated."""
 
 
+def _type_name(parameter: inspect.Parameter) -> str:
+    """The name of a parameter's type without its module. The annotation is a text in a module with
+    postponed annotations, and otherwise the type.
+    """
+    annotation = parameter.annotation
+    return str(getattr(annotation, "__name__", annotation)).rpartition(".")[2]
+
+
 class Question:
     """A question as a function of the library: `risk("rain", samples=1000)`."""
 
@@ -120,28 +128,28 @@ class Question:
 
         # The first two parameters must be positional. Kinds of parameters are ordered: all
         # positional kinds are at most POSITIONAL_OR_KEYWORD.
-        parameters = list(inspect.signature(compute).parameters.values())
+        signature = inspect.signature(compute)
+        parameters = list(signature.parameters.values())
         last_kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
         if len(parameters) < 2 or parameters[1].kind > last_kind:
             raise InputError(
                 f"question {self.name!r}",
-                f"takes ({', '.join(map(str, parameters))})",
+                f"takes {signature}",
                 "(subject, evaluator), then other subjects, * and options",
             )
-        self.takes_results_only = str(parameters[0].annotation) == "Results"
+        self.takes_results_only = _type_name(parameters[0]) == "Results"
         self.others = {
-            parameter.name: str(parameter.annotation) == "Path"
+            parameter.name: _type_name(parameter) == "Path"
             for parameter in parameters[2:]
             if parameter.kind is not parameter.KEYWORD_ONLY
         }
         """Whether each further positional parameter is a file instead of a subject, by name."""
-        names = [parameter.name for parameter in parameters]
         common_parameters = inspect.signature(Question.__call__).parameters
         # A user passes no evaluator: the signature for users lacks it.
         parameters.pop(1)
         texts = [inspect.cleandoc(compute.__doc__ or "")]
         for name, option in COMMON_OPTIONS.items():
-            if name not in names:
+            if name not in signature.parameters:
                 parameters.append(common_parameters[name])
                 texts.append(f"{name}\n    {option.meaning}")
         self.__signature__ = inspect.Signature(parameters, return_annotation="Answer")

@@ -358,6 +358,23 @@ def test_the_question_that_the_manual_adds_from_outside(
     )
 
 
+def test_a_question_from_outside_takes_results_alone_if_its_first_parameter_says_so() -> (
+    None
+):
+    """However the module writes the type: as a class, or as a text with or without its module."""
+
+    def ask(case: sv.Results, evaluator: Any, /, other: Path) -> sv.Answer: ...
+
+    with_text = dict(ask.__annotations__)
+    with_class = with_text | {"case": sv.Results, "other": Path}
+    for types in (with_text, with_class, with_text | {"case": "Results"}):
+        ask.__annotations__ = types
+        assert Question(ask).takes_results_only
+        assert Question(ask).others == {"other": True}
+    ask.__annotations__ = with_text | {"case": "Subject"}
+    assert not Question(ask).takes_results_only
+
+
 def test_a_printed_command_asks_the_same() -> None:
     """The command, parsed by its own flags, has the values that printed it, and no flag for a
     default.
